@@ -1,0 +1,68 @@
+# Only GNU make and a Python 3.11-3.13 with pip are assumed; everything else comes from requirements.lock into .venv.
+PYTHON ?= python3
+VENV   ?= .venv
+JOBS   ?= 2
+ARGS   ?=
+FIGURE ?=
+
+BIN   := $(VENV)/bin
+STAMP := $(VENV)/.installed
+CODE  := $(wildcard src envs tests benchmarks)
+
+.DEFAULT_GOAL := help
+.PHONY: help setup train test check format bench figures docs lock clean
+.DELETE_ON_ERROR:
+
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@echo
+	@echo '  PYTHON=python3.12 chooses the interpreter of a new .venv; ARGS="..." is passed on by train, test, bench and lock.'
+
+setup: $(STAMP) ## make .venv with the locked dependencies and this project (again only if the lock or pyproject.toml changed)
+
+train: $(STAMP) ## learn the cart-pole swing-up; settings: make train ARGS="trials=3 seed=1"
+	$(BIN)/pegasus-train $(if $(filter task=% resume=% --help -h,$(ARGS)),,task=cartpole) $(ARGS)
+
+test: $(STAMP) ## run the tests on JOBS=2 cores; some of them: make test ARGS="-k layers"
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --durations 10 $(ARGS)
+
+check: $(STAMP) ## formatting, lint, types, layers: everything that needs no training
+	$(BIN)/ruff format --check $(CODE)
+	$(BIN)/ruff check $(CODE)
+	$(BIN)/pyright
+	$(BIN)/python -m pytest -q tests/test_layers.py
+
+format: $(STAMP) ## format the code and fix what lint can fix
+	$(BIN)/ruff check --fix --exit-zero --quiet $(CODE)
+	$(BIN)/ruff format $(CODE)
+
+bench: $(STAMP) ## measure speed
+	$(BIN)/python -m benchmarks.suite $(ARGS)
+
+figures: $(STAMP) ## run one of the paper's experiments: make figures FIGURE=crn
+	$(BIN)/python -m benchmarks.figures $(FIGURE) $(ARGS)
+
+docs: $(STAMP) ## draw the pictures of README.md and docs/ again
+	$(BIN)/python -m benchmarks.pictures $(ARGS)
+
+lock: $(BIN)/python ## write requirements.lock again, for every Python and platform; newer versions: make lock ARGS=--upgrade
+	test -x $(BIN)/uv || $(BIN)/python -m pip install uv
+	UV_CUSTOM_COMPILE_COMMAND="make lock" $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev \
+	  --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate $(ARGS) pyproject.toml -o requirements.lock
+
+clean: ## remove .venv and every cache; runs/ stays
+	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "Python 3.11, 3.12 or 3.13 is needed and $(PYTHON) is not one: make $(MAKECMDGOALS) PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null && $(PYTHON) -m venv $(VENV) || \
+	  { $(PYTHON) -m venv --without-pip $(VENV) && $(PYTHON) -m pip --python $(VENV)/bin/python install --quiet pip; }
+
+# Two commands because pip refuses an editable install in hash mode; the build backend, hatchling, is in the lock.
+$(STAMP): requirements.lock pyproject.toml | $(BIN)/python
+	@echo 'installing requirements.lock into $(VENV) (about a minute and 1.5 GB)'
+	@$(BIN)/python -m pip install -qq --require-hashes -r requirements.lock
+	@$(BIN)/python -m pip install -qq --no-deps --no-build-isolation --editable .
+	@touch $@
