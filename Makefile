@@ -16,7 +16,7 @@ CODE  := $(wildcard src envs tests benchmarks)
 help: ## list the targets
 	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo
-	@echo '  PYTHON=python3.12 chooses the interpreter of a new .venv; ARGS="..." is passed on by train, test, bench and lock.'
+	@echo '  PYTHON=python3.12 chooses the interpreter of a new .venv; ARGS="..." goes to the program that the target runs.'
 
 setup: $(STAMP) ## make .venv with the locked dependencies and this project (again only if the lock or pyproject.toml changed)
 
