@@ -1,0 +1,90 @@
+"""Cart-pole swing-up: a cart on a rail carries a freely turning rod, which a force on the cart shall swing upright."""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from pegasus_envs import physics
+from pegasus_envs.physics import Motion, Scalar
+from pegasus_envs.plant import Plant, draw_start
+
+XML = "cartpole.xml"
+POLE, CART = 2, 1
+
+
+def cartpole(
+    *,
+    pole_length: Scalar = 0.6,
+    pole_mass: Scalar = 0.5,
+    cart_mass: Scalar = 0.5,
+    friction: Scalar = 0.1,
+    gravity: Scalar = 9.82,
+) -> Plant:
+    """The paper's cart-pole; x = [position, its rate, the angle's rate, angle], angle 0 hanging and pi upright.
+
+    Args:
+        pole_length: of the uniform rod [m]
+        pole_mass: [kg]
+        cart_mass: [kg]
+        friction: of the cart on its rail, viscous [N s/m]
+        gravity: [m/s^2]
+
+    Any of them may be traced: `jax.vmap(lambda length: simulate(cartpole(pole_length=length), ...))`.
+    """
+    system = physics.load(XML, _changes(pole_length, pole_mass, cart_mass, friction, gravity))
+    dt = 0.1
+    low, high = system.host.actuator_ctrlrange.T.copy()
+
+    def place(x: Array) -> Motion:
+        return Motion(jnp.stack([x[0], x[3]]), jnp.stack([x[1], x[2]]))
+
+    def step(motion: Motion, control: Array) -> Motion:
+        return physics.hold(system, motion, jnp.clip(control, low, high), dt)
+
+    def observe(motion: Motion) -> Array:
+        (position, angle), (speed, rate) = motion
+        return jnp.stack([position, speed, rate, angle])
+
+    def error(x: Array) -> Array:
+        """From the tip to where it is when the pole stands upright over the middle of the rail [m]."""
+        return jnp.stack([x[0] + pole_length * jnp.sin(x[3]), pole_length * (jnp.cos(x[3]) + 1.0)])
+
+    start_mean, start_std = np.zeros(4), np.full(4, 0.2)
+    return Plant(
+        reset=lambda key: place(draw_start(key, start_mean, start_std)),
+        step=step,
+        observe=observe,
+        place=place,
+        error=error,
+        width=0.25,
+        control_low=low,
+        control_high=high,
+        dt=dt,
+        horizon=25,
+        start_mean=start_mean,
+        start_std=start_std,
+        sensor_std=np.full(4, 0.01),
+        angles=(3,),
+        state_names=("x [m]", "x' [m/s]", "theta' [rad/s]", "theta [rad]"),
+        control_names=("force [N]",),
+        model=system.host,
+        qpos=lambda motion: motion.qpos,
+    )
+
+
+def _changes(length: Scalar, mass: Scalar, cart: Scalar, friction: Scalar, gravity: Scalar) -> dict:
+    """The fields of the model that the constants determine; the last three are for the eye only."""
+    model = physics.default(XML)
+    pole, tip, goal = (model.geom(name).id for name in ("pole", "tip", "goal"))
+    rod = mass * length**2 / 12.0
+    inertia = physics.put(physics.put(model.body_inertia, (POLE, 0), rod), (POLE, 1), rod)
+    visible = physics.put(model.geom_pos, (pole, 2), -0.5 * length)
+    visible = physics.put(visible, (tip, 2), -1.0 * length)
+    return {
+        "body_ipos": physics.put(model.body_ipos, (POLE, 2), -0.5 * length),
+        "body_inertia": inertia,
+        "body_mass": physics.put(physics.put(model.body_mass, POLE, mass), CART, cart),
+        "dof_damping": physics.put(model.dof_damping, 0, friction),
+        "geom_pos": physics.put(visible, (goal, 2), length),
+        "geom_size": physics.put(model.geom_size, (pole, 1), 0.5 * length),
+    }

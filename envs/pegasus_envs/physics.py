@@ -1,0 +1,166 @@
+"""Smooth rigid-body physics by MJX: one evaluation of the acceleration, a Runge-Kutta step around it.
+
+`mjx.step` with RK4 evaluates `mjx.forward` four times in the compiled program, each with every feature of MuJoCo; for
+a small mechanism the compiler then works far longer than the simulation. Here the four stages are a loop around one
+evaluation, which calls only the passes that a mechanism without contacts, constraints, tendons or activation states
+needs. The physics is MJX's own, and tests hold it to `mjx.step` and to C MuJoCo.
+"""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's bindings and MJX's data classes declare few of their names.)
+
+import copy
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+from mujoco import mjx
+
+ASSETS = Path(__file__).parent / "assets"
+
+# The classical Runge-Kutta method of order four: where to evaluate a stage, and the weight of the slope found there.
+_OFFSETS = np.array([0.0, 0.5, 0.5, 1.0])
+_WEIGHTS = np.array([1.0, 2.0, 2.0, 1.0]) / 6.0
+
+
+class Motion(NamedTuple):
+    """Generalised positions [nq] and velocities [nv]."""
+
+    qpos: Array
+    qvel: Array
+
+
+Scalar = float | Array
+"""A physical constant, traced or not."""
+
+_Stage = tuple[Array, Array, Array, Array]
+"""velocity and acceleration of the last stage, their weighted means so far: each [nv]"""
+
+
+class Physics(NamedTuple):
+    """A mechanism, on the device and on the host."""
+
+    device: Any
+    """mjx.Model"""
+    blank: Any
+    """mjx.Data that no evaluation changes: each works on its own copy"""
+    host: mujoco.MjModel
+
+
+@cache
+def _compiled(name: str) -> mujoco.MjModel:
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / name))
+    if model.neq or model.ntendon or model.na or not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT:
+        raise ValueError(f"{name}: only mechanisms without constraints, tendons and activation states")
+    return model
+
+
+@cache
+def _on_device(name: str, x64: bool) -> tuple[Any, Any]:
+    del x64  # part of the cache's key only: the arrays have that precision
+    with jax.ensure_compile_time_eval():  # so that a plant may be built inside jit, and still be cached
+        return mjx.put_model(_compiled(name), impl="jax"), mjx.make_data(_compiled(name), impl="jax")
+
+
+def load(name: str, changes: dict[str, Any] | None = None) -> Physics:
+    """Read `assets/name`, then overwrite fields of the model with the given arrays, which may be traced.
+
+    The host's copy changes too, unless a value is traced: then it keeps the file's constants.
+    """
+    changes = changes or {}
+    device, blank = _on_device(name, bool(jax.config.jax_enable_x64))
+    device = device.replace(**{field: jnp.asarray(value, float) for field, value in changes.items()})
+    host = copy.copy(_compiled(name))
+    if not any(isinstance(value, jax.core.Tracer) for value in changes.values()):
+        for field, value in changes.items():
+            getattr(host, field)[:] = np.asarray(value)
+    return Physics(device, blank, host)
+
+
+def default(name: str) -> mujoco.MjModel:
+    """The model that `assets/name` describes; shared, so not to be written to."""
+    return _compiled(name)
+
+
+def put(array: Any, index: Any, value: Any) -> Any:
+    """A copy of `array` with `value` at `index`; a JAX array only if one of the two is."""
+    if isinstance(value, jax.Array) or isinstance(array, jax.Array):
+        return jnp.asarray(array, float).at[index].set(value)
+    array = np.array(array)
+    array[index] = value
+    return array
+
+
+def acceleration(physics: Physics, qpos: Array, qvel: Array, control: Array) -> Array:
+    """Generalised acceleration [nv] under actuator commands [nu]."""
+    model = physics.device
+    data = physics.blank.replace(qpos=qpos, qvel=qvel, ctrl=control)
+    for compute in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.transmission, mjx.com_vel, mjx.passive, mjx.rne):
+        data = compute(model, data)
+    moment = data._impl.actuator_moment
+    data = mjx.fwd_actuation(model, data.tree_replace({"_impl.actuator_velocity": moment @ qvel}))
+    force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+    return jax.scipy.linalg.solve(mjx.full_m(model, data), force, assume_a="pos")
+
+
+def displace(physics: Physics, qpos: Array, velocity: Array, time: Array | float) -> Array:
+    """Positions [nq] after moving with a constant generalised velocity [nv] for a time [s].
+
+    The free joint, where there is one, comes first: a position, then a quaternion that turns in the body's frame.
+    """
+    if physics.host.nq == physics.host.nv:
+        return qpos + time * velocity
+    turned = rotate(qpos[3:7], time * velocity[3:6])
+    return jnp.concatenate([qpos[:3] + time * velocity[:3], turned, qpos[7:] + time * velocity[6:]])
+
+
+def rotate(quaternion: Array, turn: Array) -> Array:
+    """Turn an attitude [w x y z] by a rotation vector [rad] given in the body's frame."""
+    half = 0.5 * jnp.sqrt(turn @ turn + 1e-30)  # the small number keeps the derivative at rest finite
+    w, (x, y, z) = jnp.cos(half), 0.5 * turn * jnp.sinc(half / jnp.pi)
+    a, b, c, d = quaternion
+    product = [
+        a * w - b * x - c * y - d * z,
+        a * x + b * w + c * z - d * y,
+        a * y - b * z + c * w + d * x,
+        a * z + b * y - c * x + d * w,
+    ]
+    turned = jnp.stack(product)
+    return turned / jnp.sqrt(turned @ turned)
+
+
+def runge_kutta(physics: Physics, motion: Motion, control: Array) -> Motion:
+    """One time step of the model's length, with the actuator commands [nu] held."""
+    step = physics.host.opt.timestep
+
+    def stage(carry: _Stage, tableau: Array) -> tuple[_Stage, None]:
+        velocity, slope, mean_velocity, mean_slope = carry
+        offset, weight = tableau[0] * step, tableau[1]
+        qpos = displace(physics, motion.qpos, velocity, offset)
+        velocity = motion.qvel + offset * slope
+        slope = acceleration(physics, qpos, velocity, control)
+        return (velocity, slope, mean_velocity + weight * velocity, mean_slope + weight * slope), None
+
+    zero = jnp.zeros_like(motion.qvel)
+    tableau = jnp.asarray(np.stack([_OFFSETS, _WEIGHTS], axis=1), motion.qvel.dtype)
+    (_, _, velocity, slope), _ = jax.lax.scan(stage, (zero, zero, zero, zero), tableau)
+    return Motion(displace(physics, motion.qpos, velocity, step), motion.qvel + step * slope)
+
+
+def hold(physics: Physics, motion: Motion, control: Array, dt: float) -> Motion:
+    """The motion one control period [s] later, under held actuator commands [nu]."""
+
+    def advance(motion: Motion, _: None) -> tuple[Motion, None]:
+        return runge_kutta(physics, motion, control), None
+
+    return jax.lax.scan(advance, motion, None, length=substeps(physics, dt))[0]
+
+
+def substeps(physics: Physics, dt: float) -> int:
+    """How many time steps of the model make up a control period [s]."""
+    return round(dt / physics.host.opt.timestep)
