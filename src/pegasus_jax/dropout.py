@@ -35,6 +35,7 @@ def none() -> Dropout:
         mask=lambda params, noise: jnp.ones_like(noise),
         kl=lambda params: jnp.zeros(()),
         retain=lambda params: jnp.ones(()),
+        decay=_undiminished,
     )
 
 
@@ -53,6 +54,7 @@ def binary(rate: float = 0.1) -> Dropout:
         mask=lambda params, noise: (noise < keep).astype(noise.dtype),
         kl=lambda params: jnp.zeros(()),
         retain=lambda params: jnp.full((), keep),
+        decay=lambda params: jnp.full((), keep),
     )
 
 
@@ -63,7 +65,7 @@ def concrete(rate: float = 0.1, temperature: float = 0.1) -> Dropout:
     z = sigmoid((noise - logit) / temperature) with logistic base noise (the logit of a uniform, drawn once so that
     `mask` takes no logarithms). `kl` is that of the unrelaxed Bernoulli(p) to Bernoulli(1/2): log 2 - H(p) per unit,
     which is Gal's entropy term plus a constant; his weight term, (1 - p) |W|^2 / 2, belongs to the layer (see
-    `retain`). ValueError unless 0 < rate < 1 and temperature > 0.
+    `decay`). ValueError unless 0 < rate < 1 and temperature > 0.
     """
     if not (0.0 < rate < 1.0 and temperature > 0.0):
         raise ValueError(f"concrete dropout needs 0 < rate < 1 and temperature > 0, got {rate} and {temperature}")
@@ -90,6 +92,7 @@ def concrete(rate: float = 0.1, temperature: float = 0.1) -> Dropout:
         mask=lambda params, noise: jax.nn.sigmoid((noise - params["logit"]) / temperature),
         kl=kl,
         retain=retain,
+        decay=lambda params: jax.nn.sigmoid(-params["logit"]),
     )
 
 
@@ -196,7 +199,7 @@ def log_normal(
         upper, lower = log_ndtr(beta - sigma), log_ndtr(alpha - sigma)
         return jnp.exp(mu + 0.5 * sigma**2 + upper + jnp.log1p(-jnp.exp(lower - upper))) / _mass(alpha, beta)
 
-    return Dropout(init=init, sample=_open_uniform, mask=mask, kl=kl, retain=retain)
+    return Dropout(init=init, sample=_open_uniform, mask=mask, kl=kl, retain=retain, decay=_undiminished)
 
 
 def _normal(name, start, log_alpha, kl):
@@ -207,7 +210,13 @@ def _normal(name, start, log_alpha, kl):
         mask=lambda params, noise: 1.0 + jnp.exp(0.5 * log_alpha(params)) * noise,
         kl=kl,
         retain=lambda params: jnp.ones_like(params[name]),
+        decay=_undiminished,
     )
+
+
+def _undiminished(params):
+    """`decay` of a kind whose noise does not thin the weight prior."""
+    return jnp.ones(())
 
 
 def _relative_variance(rate):

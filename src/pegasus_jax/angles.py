@@ -1,0 +1,30 @@
+"""Angles enter networks as (sin, cos) and leave data as wrapped differences (Deisenroth 2010)."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax.types import Array
+
+
+def encode(x: Array, angles: tuple[int, ...]) -> Array:
+    """Features [..., F] of states x [..., D]: the other dimensions, then all sines, then all cosines; F = D + A."""
+    plain = [i for i in range(x.shape[-1]) if i not in angles]
+    angle = x[..., np.array(angles, int)]
+    return jnp.concatenate([x[..., np.array(plain, int)], jnp.sin(angle), jnp.cos(angle)], axis=-1)
+
+
+def feature_names(names: tuple[str, ...], angles: tuple[int, ...]) -> tuple[str, ...]:
+    """Names of the features of `encode`, in its order."""
+    plain = tuple(name for i, name in enumerate(names) if i not in angles)
+    return plain + tuple(f"sin {names[i]}" for i in angles) + tuple(f"cos {names[i]}" for i in angles)
+
+
+def wrap(angle: Array) -> Array:
+    """The same angle [rad] in [-pi, pi]; exact (no change at all) for angles already inside."""
+    return jnp.where(jnp.abs(angle) <= jnp.pi, angle, jnp.arctan2(jnp.sin(angle), jnp.cos(angle)))
+
+
+def difference(after: Array, before: Array, angles: tuple[int, ...]) -> Array:
+    """after - before [..., D], the angle dimensions wrapped: a roll that crosses 180 degrees has not jumped."""
+    change = after - before
+    return change.at[..., np.array(angles, int)].set(wrap(change[..., np.array(angles, int)])) if angles else change

@@ -1,0 +1,191 @@
+"""Every setting, typed, with its default and its limits. Frozen and hashable: a config is a key.
+
+The first line of a field's comment is its help text. Values are checked when a config is made, and a bad one raises
+`SettingError` with one line that names the setting, the value and what was expected.
+"""
+
+import dataclasses
+import difflib
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+
+class SettingError(ValueError):
+    """A setting that cannot be; the message is one line for the person who set it."""
+
+
+def nearest(name: str, choices: Iterable[str]) -> str:
+    """The end of an error message: the nearest valid choice, and all of them."""
+    choices = [str(c) for c in choices]
+    close = difflib.get_close_matches(str(name), choices, n=1, cutoff=0.4)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    return f"{hint}choices: {', '.join(choices)}"
+
+
+def _choice(name: str, value: str, choices: Iterable[str]) -> None:
+    if value not in tuple(choices):
+        raise SettingError(f"{name}={value} is not a choice; {nearest(value, choices)}")
+
+
+def _within(name: str, value: float, low: float, high: float = math.inf, *, open_low: bool = False) -> None:
+    if not math.isfinite(value) or value > high or value < low or (open_low and value == low):
+        interval = f"{'(' if open_low else '['}{low:g}, {high:g}{')' if high == math.inf else ']'}"
+        nearest_value = min(max(value, low), high) if math.isfinite(value) and not open_low else None
+        hint = f"; the nearest is {nearest_value:g}" if nearest_value is not None else ""
+        raise SettingError(f"{name}={value:g} is out of range; expected a number in {interval}{hint}")
+
+
+def _layers(name: str, value: Any) -> tuple[int, ...]:
+    layers = tuple(value)
+    for width in layers:
+        _within(name, width, 1)
+    return layers
+
+
+DROPOUTS = ("log_normal", "binary", "concrete", "gaussian", "sparse", "none")
+HEADS = ("sigmoid", "softplus")
+INITIALISERS = ("glorot", "orthogonal")
+SQUASHES = ("tanh", "sine")
+EXPLORATIONS = ("uniform", "walk")
+AGGREGATES = ("mean", "total")
+EXECUTIONS = ("sampled", "mean")
+
+
+@dataclass(frozen=True)
+class BNN:
+    """Bayesian neural network dynamics."""
+
+    hidden: tuple[int, ...] = (200, 200)  # widths of the hidden layers
+    dropout: str = "log_normal"  # noise on the units: log_normal, binary, concrete, gaussian, sparse, none
+    rate: float = 0.1  # drop probability of binary dropout, initial one of concrete dropout
+    low: float = -10.0  # lower end of the interval of log z (log_normal)
+    high: float = 0.0  # upper end of the interval of log z (log_normal)
+    input_noise: bool = False  # noise on the network's own inputs as well
+    heteroscedastic: bool = True  # predicted noise depends on the input
+    head: str = "sigmoid"  # form of the predicted noise: sigmoid (at most .1 of the target's scale), softplus
+    whitening: str = "full"  # scaling of inputs and targets: full covariance, or diagonal
+    weight_decay: float = 1.0  # factor of the Gaussian prior on the weights
+    initialiser: str = "glorot"  # initial weights: glorot, orthogonal
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hidden", _layers("model.hidden", self.hidden))
+        _choice("model.dropout", self.dropout, DROPOUTS)
+        _choice("model.head", self.head, HEADS)
+        _choice("model.whitening", self.whitening, ("full", "diagonal"))
+        _choice("model.initialiser", self.initialiser, INITIALISERS)
+        _within("model.rate", self.rate, 0, 0.99)
+        _within("model.weight_decay", self.weight_decay, 0)
+        if not self.low < self.high:
+            raise SettingError(f"model.low={self.low:g} must be less than model.high={self.high:g}")
+
+
+@dataclass(frozen=True)
+class MLP:
+    """A ReLU network controller."""
+
+    hidden: tuple[int, ...] = (200, 200)  # widths of the hidden layers
+    dropout: float = 0.1  # drop probability of the hidden units; 0 is a deterministic policy
+    squash: str = "tanh"  # saturation: tanh, or sine, (9 sin v + sin 3v)/8
+    execution: str = "sampled"  # on the plant: sampled (a fresh mask each step, explores), or mean
+    output_scale: float = 1.0  # factor of the last layer's initial weights
+    initialiser: str = "glorot"  # initial weights: glorot, orthogonal
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hidden", _layers("policy.hidden", self.hidden))
+        _choice("policy.squash", self.squash, SQUASHES)
+        _choice("policy.execution", self.execution, EXECUTIONS)
+        _choice("policy.initialiser", self.initialiser, INITIALISERS)
+        _within("policy.dropout", self.dropout, 0, 0.99)
+        _within("policy.output_scale", self.output_scale, 0, open_low=True)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Model learning after each trial."""
+
+    steps: int = 2000  # updates a trial
+    batch: int = 100  # rows an update
+    learning_rate: float = 1e-4  # Adam's step size
+    reset: bool = False  # forget Adam's moments at each trial
+
+    def __post_init__(self) -> None:
+        _within("fit.steps", self.steps, 1)
+        _within("fit.batch", self.batch, 1)
+        _within("fit.learning_rate", self.learning_rate, 0, open_low=True)
+
+
+@dataclass(frozen=True)
+class Period:
+    """For how many iterations each draw of the scenarios is kept; 0: the whole search of a trial."""
+
+    start: int = 1  # first states
+    dynamics: int = 0  # draws of the model
+    policy: int = 0  # draws of the policy
+    sensor: int = 0  # noise on what the policy sees
+    match: int = 0  # noise of the moment matching
+
+    def __post_init__(self) -> None:
+        for f in dataclasses.fields(self):
+            _within(f"search.period.{f.name}", getattr(self, f.name), 0)
+
+
+@dataclass(frozen=True)
+class Search:
+    """Policy search after each fit."""
+
+    steps: int = 1000  # iterations a trial
+    particles: int = 100  # K, imagined rollouts an iteration
+    learning_rate: float = 1e-3  # Adam's step size
+    clip: float | None = 1.0  # largest global norm of the gradient; null: no clipping
+    match: bool = True  # moment matching
+    balanced: bool = False  # make the drawn noise exactly zero mean, unit covariance over the particles
+    aggregate: str = "mean"  # over the horizon: mean (authors' code) or total (the paper's sum)
+    discount: float = 1.0  # weight of a later step against the one before
+    reset: bool = True  # forget Adam's moments at each trial
+    policy_noise: float = 1.0  # factor of the predicted noise on what the policy sees
+    state_noise: float = 0.0  # factor of the predicted noise added to the state
+    cost_noise: float = 0.0  # factor of the predicted noise on what the cost sees
+    period: Period = field(default_factory=Period)
+
+    def __post_init__(self) -> None:
+        _within("search.steps", self.steps, 1)
+        _within("search.particles", self.particles, 2)
+        _within("search.learning_rate", self.learning_rate, 0, open_low=True)
+        if self.clip is not None:
+            _within("search.clip", self.clip, 0, open_low=True)
+        _choice("search.aggregate", self.aggregate, AGGREGATES)
+        _within("search.discount", self.discount, 0, 1, open_low=True)
+        for name in ("policy_noise", "state_noise", "cost_noise"):
+            _within(f"search.{name}", getattr(self, name), 0)
+
+
+@dataclass(frozen=True)
+class Explore:
+    """The first episodes, before there is a model."""
+
+    trials: int = 1  # episodes of random controls
+    kind: str = "uniform"  # uniform: a fresh control each step; walk: a random walk
+
+    def __post_init__(self) -> None:
+        _within("explore.trials", self.trials, 0)
+        _choice("explore.kind", self.kind, EXPLORATIONS)
+
+
+@dataclass(frozen=True)
+class Config:
+    """One run."""
+
+    task: str = "cartpole"  # what to learn
+    seed: int = 0  # all randomness of the run comes from it
+    trials: int = 15  # episodes on the plant, the random ones included
+    model: BNN = field(default_factory=BNN)
+    policy: MLP = field(default_factory=MLP)
+    fit: Fit = field(default_factory=Fit)
+    search: Search = field(default_factory=Search)
+    explore: Explore = field(default_factory=Explore)
+
+    def __post_init__(self) -> None:
+        _within("seed", self.seed, 0, 2**32 - 1)
+        _within("trials", self.trials, 1, 10_000)

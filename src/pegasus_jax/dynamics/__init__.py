@@ -1,0 +1,1 @@
+"""Models of the dynamics: each module makes values of `types.Dynamics`."""

@@ -1,0 +1,56 @@
+"""Model learning: minimise a model's loss over minibatches of all data (eq. 2, Alg. 1 line 5)."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from pegasus_jax.dataset import minibatch
+from pegasus_jax.types import Array, Batch, Dataset, Key, Learner, Params
+
+
+class FitInfo(NamedTuple):
+    """How a fit went."""
+
+    loss: Array  # [] mean over the last tenth of the steps [nats a row]
+    first: Array  # [] the same over the first tenth
+    skipped: Array  # [] updates skipped because a gradient was not finite
+
+
+def guarded(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
+    """The optimiser, except that a gradient with a non-finite entry changes nothing and is counted."""
+    return optax.apply_if_finite(optimizer, max_consecutive_errors=2**31 - 1)
+
+
+def skipped(state: optax.OptState) -> Array:
+    """Updates a `guarded` optimiser has skipped so far."""
+    return state.total_notfinite  # type: ignore[union-attr]
+
+
+def fit(
+    key: Key,
+    learner: Learner,
+    data: Dataset,
+    *,
+    prepare: Callable[[Dataset], Params],
+    loss: Callable[[Params, Key, Batch, Params], Array],
+    optimizer: optax.GradientTransformation,
+    steps: int,
+    batch: int,
+) -> tuple[Learner, FitInfo]:
+    """`steps` updates of the model's parameters, each on `batch` rows and fresh noise."""
+    context = prepare(data)
+    before = skipped(learner.optimizer)
+
+    def step(learner: Learner, key: Key) -> tuple[Learner, Array]:
+        row_key, noise_key = jax.random.split(key)
+        rows = minibatch(row_key, data, batch)
+        value, gradient = jax.value_and_grad(loss)(learner.params, noise_key, rows, context)
+        updates, state = optimizer.update(gradient, learner.optimizer, learner.params)
+        return Learner(optax.apply_updates(learner.params, updates), state), value
+
+    learner, losses = jax.lax.scan(step, learner, jax.random.split(key, steps))
+    tenth = max(steps // 10, 1)
+    return learner, FitInfo(jnp.mean(losses[-tenth:]), jnp.mean(losses[:tenth]), skipped(learner.optimizer) - before)

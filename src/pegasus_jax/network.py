@@ -1,0 +1,37 @@
+"""The one network: a ReLU multilayer perceptron whose noise is an argument."""
+
+from collections.abc import Callable, Sequence
+
+import flax.linen as nn
+import jax
+
+from pegasus_jax.types import Array
+
+INITIALISERS: dict[str, Callable] = {
+    "glorot": nn.initializers.glorot_normal(),
+    "orthogonal": nn.initializers.orthogonal(),
+}
+
+
+def _small_uniform(key: jax.Array, shape: Sequence[int], dtype: object = None) -> Array:
+    return jax.random.uniform(key, shape, minval=-0.01, maxval=0.01)  # as the authors' (reference settings 4.1)
+
+
+class MLP(nn.Module):
+    """Dense layers with ReLU between them; layer i sees its input times masks[i] (None: as it is)."""
+
+    hidden: tuple[int, ...]
+    outputs: int
+    initialiser: str = "glorot"
+
+    @nn.compact
+    def __call__(self, x: Array, masks: Sequence[Array | None]) -> Array:
+        """Outputs [..., outputs] for inputs x [..., F]; masks[i] broadcasts against layer i's input."""
+        kernel_init = INITIALISERS[self.initialiser]
+        for i, width in enumerate((*self.hidden, self.outputs)):
+            mask = masks[i]
+            x = x if mask is None else x * mask
+            x = nn.Dense(width, kernel_init=kernel_init, bias_init=_small_uniform, name=f"layer_{i}")(x)
+            if i < len(self.hidden):
+                x = nn.relu(x)
+        return x

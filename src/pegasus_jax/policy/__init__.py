@@ -1,0 +1,1 @@
+"""Controllers: each module makes values of `types.Policy`."""

@@ -1,0 +1,50 @@
+"""A ReLU network controller, with multiplicative noise on its hidden units or without."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.network import MLP
+from pegasus_jax.types import Array, Dropout, Key, Params, Policy
+
+
+def mlp(
+    *,
+    encode: Callable[[Array], Array],
+    features: int,
+    controls: int,
+    hidden: tuple[int, ...],
+    dropout: Dropout,
+    saturate: Callable[[Array], Array],
+    initialiser: str,
+    input_scale: Array | float = 1.0,
+    output_scale: float = 1.0,
+) -> Policy:
+    """u = saturate(network(encode(x) * input_scale)); the noise is on each hidden layer's output (settings 5.1).
+
+    `output_scale` multiplies the last layer's initial weights: how far from the middle of the limits, and how near to
+    saturation, a policy starts.
+    """
+    network = MLP(hidden, controls, initialiser)
+
+    def init(key: Key) -> Params:
+        net_key, *keys = jax.random.split(key, 1 + len(hidden))
+        net = network.init(net_key, jnp.zeros(features), [None] * (len(hidden) + 1))
+        last = f"layer_{len(hidden)}"
+        net["params"][last]["kernel"] = net["params"][last]["kernel"] * output_scale
+        return {"network": net, "noise": tuple(dropout.init(k, w) for k, w in zip(keys, hidden, strict=True))}
+
+    def sample(key: Key) -> tuple[Array, ...]:
+        keys = jax.random.split(key, len(hidden))
+        return tuple(dropout.sample(k, w) for k, w in zip(keys, hidden, strict=True))
+
+    def apply(params: Params, noise: tuple[Array, ...] | None, x: Array) -> Array:
+        """u [U]; noise None is the mean policy, every unit at its expected size."""
+        if noise is None:
+            masks = [dropout.retain(p) for p in params["noise"]]
+        else:
+            masks = [dropout.mask(p, z) for p, z in zip(params["noise"], noise, strict=True)]
+        return saturate(network.apply(params["network"], encode(x) * input_scale, [None, *masks]))
+
+    return Policy(init, sample, apply)

@@ -1,0 +1,23 @@
+"""Smooth saturations of the real line to [-1, 1], scaled to a plant's control limits."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+
+from pegasus_jax.types import Array
+
+Squash = Callable[[Array], Array]
+
+
+def sine(v: Array) -> Array:
+    """(9 sin v + sin 3v) / 8, PILCO's saturation: its moments under a Gaussian are exact."""
+    return (9 * jnp.sin(v) + jnp.sin(3 * v)) / 8
+
+
+SQUASHES: dict[str, Squash] = {"tanh": jnp.tanh, "sine": sine}
+
+
+def to_limits(squash: Squash, low: Array, high: Array) -> Squash:
+    """v [U] -> u [U] in [low, high]."""
+    middle, half = (high + low) / 2, (high - low) / 2
+    return lambda v: middle + half * squash(v)

@@ -1,0 +1,50 @@
+"""K imagined trajectories as a deterministic function of policy, belief and scenarios. No keys here."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenarios
+
+
+class NoiseUse(NamedTuple):
+    """Where the model's predicted observation noise enters a rollout, as factors of it (reference settings 5.4)."""
+
+    policy: float = 1.0  # the policy sees x_t + factor * std_t * noise_t
+    state: float = 0.0  # the state itself moves by factor * std * noise
+    cost: float = 0.0  # the cost sees x_t + factor * std_t * noise_t
+
+
+def rollout(
+    policy_params: Params,
+    belief: Params,
+    scenarios: Scenarios,
+    *,
+    dynamics: Dynamics,
+    policy: Policy,
+    match: Callable[[Array, Array], Array],
+    noise: NoiseUse = NoiseUse(),
+) -> Rollout:
+    """Roll K particles out for H steps (Alg. 3 lines 6 to 15).
+
+    Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match` is
+    `moments.match` or `moments.keep`. No gradient flows through the predicted noise.
+    """
+    act = jax.vmap(policy.apply, (None, 0, 0))
+    predict = jax.vmap(dynamics.apply, (None, 0, 0, 0))
+
+    def step(carry: tuple[Array, Array], draws: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple]:
+        x, blur = carry
+        sensor, redraw = draws
+        u = act(policy_params, scenarios.policy, x + noise.policy * blur)
+        change = predict(belief, scenarios.dynamics, x, u)
+        std = jax.lax.stop_gradient(change.std)
+        blur = std * sensor
+        after = match(x + change.mean + noise.state * blur, redraw)
+        return (after, blur), (after, u, std, after + noise.cost * blur)
+
+    start = scenarios.start
+    _, (x, u, std, seen) = jax.lax.scan(step, (start, jnp.zeros_like(start)), (scenarios.sensor, scenarios.match))
+    return Rollout(jnp.concatenate([start[None], x]), u, std, seen)

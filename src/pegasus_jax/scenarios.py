@@ -1,0 +1,71 @@
+"""The only place that draws the noise of imagined rollouts."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.moments import standardise
+from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, Scenarios
+
+
+def blocks(
+    *, dynamics: Dynamics, policy: Policy, start: Callable[[Key], Array], particles: int, horizon: int, balanced: bool
+) -> Scenarios:
+    """How each block of the scenarios is drawn: a Scenarios of functions (key, belief) -> block.
+
+    With `balanced`, the normal draws of every time step have exactly zero mean and unit covariance over the particles,
+    so that matched particles have exactly the moments asked for.
+    """
+
+    def each(sample: Callable[[Key], Params]) -> Callable[[Key], Params]:
+        return lambda key: jax.vmap(sample)(jax.random.split(key, particles))
+
+    def normal(key: Key, _: Params) -> Array:
+        states = jax.eval_shape(start, key).shape[0]
+        z = jax.random.normal(key, (horizon, particles, states))
+        return standardise(z) if balanced else z
+
+    return Scenarios(
+        start=lambda key, _: each(start)(key),
+        dynamics=lambda key, belief: each(lambda k: dynamics.sample(k, belief))(key),
+        policy=lambda key, _: each(policy.sample)(key),
+        sensor=normal,
+        match=normal,
+    )
+
+
+def draw(key: Key, step: Array | int, belief: Params, *, blocks: Scenarios, period: Period) -> Scenarios:
+    """The scenarios in force at a search iteration.
+
+    Block b at iteration i is drawn from fold_in(fold_in(key, b), i // period_b): any iteration's scenarios can be had
+    without those before it, so a search may stop and go on anywhere.
+    """
+
+    def one(block: int, sample: Callable, every: int) -> Params:
+        return sample(jax.random.fold_in(jax.random.fold_in(key, block), _epoch(step, every)), belief)
+
+    return Scenarios(*(one(i, *pair) for i, pair in enumerate(zip(blocks, period, strict=True))))
+
+
+def redraw(
+    key: Key, step: Array, scenarios: Scenarios, belief: Params, *, blocks: Scenarios, period: Period
+) -> Scenarios:
+    """`draw` for the iteration after the one whose scenarios are given; draws only the blocks that change."""
+    renewed = {}
+    for every in sorted(set(period) - {0}):
+        names = [name for name, p in zip(Scenarios._fields, period, strict=True) if p == every]
+
+        def fresh(names: list[str] = names) -> dict[str, Params]:
+            drawn = draw(key, step, belief, blocks=blocks, period=period)  # the blocks not asked for are dead code
+            return {name: getattr(drawn, name) for name in names}
+
+        def held(names: list[str] = names) -> dict[str, Params]:
+            return {name: getattr(scenarios, name) for name in names}
+
+        renewed |= fresh() if every == 1 else jax.lax.cond(step % every == 0, fresh, held)
+    return scenarios._replace(**renewed)
+
+
+def _epoch(step: Array | int, every: int) -> Array:
+    return jnp.asarray(step // every if every else 0, jnp.uint32)

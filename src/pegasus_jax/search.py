@@ -1,0 +1,72 @@
+"""Policy search: follow the gradient of the imagined cost under held scenarios (Alg. 3)."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from pegasus_jax import cost as costs
+from pegasus_jax.fit import skipped
+from pegasus_jax.rollout import NoiseUse, rollout
+from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Policy, Scenarios
+
+
+class SearchInfo(NamedTuple):
+    """How a search went, iteration by iteration."""
+
+    objective: Array  # [steps]
+    gradient_norm: Array  # [steps] before clipping
+    skipped: Array  # [] updates skipped because a gradient was not finite
+
+
+def objective(
+    policy_params: Params,
+    belief: Params,
+    scenarios: Scenarios,
+    *,
+    dynamics: Dynamics,
+    policy: Policy,
+    match: Callable[[Array, Array], Array],
+    cost: Callable[[Array], Array],
+    aggregate: Callable[[Array], Array] = costs.mean,
+    noise: NoiseUse = NoiseUse(),
+) -> Array:
+    """J(theta) (Alg. 3 line 16): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
+    imagined = rollout(
+        policy_params, belief, scenarios, dynamics=dynamics, policy=policy, match=match, noise=noise
+    )
+    return aggregate(cost(imagined.seen))
+
+
+def optimise(
+    key: Key,
+    learner: Learner,
+    belief: Params,
+    *,
+    draw: Callable[[Key, Array, Params], Scenarios],
+    redraw: Callable[[Key, Array, Scenarios, Params], Scenarios],
+    objective: Callable[[Params, Params, Scenarios], Array],
+    optimizer: optax.GradientTransformation,
+    steps: int,
+    first: Array | int = 0,
+) -> tuple[Learner, SearchInfo]:
+    """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 20).
+
+    One call of n steps and two calls of n/2, the second with first=n/2, do the same.
+    """
+    first = jnp.asarray(first, jnp.int32)
+    before = skipped(learner.optimizer)
+
+    def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], tuple[Array, Array]]:
+        learner, scenarios = carry
+        value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios)
+        updates, state = optimizer.update(gradient, learner.optimizer, learner.params)
+        learner = Learner(optax.apply_updates(learner.params, updates), state)
+        scenarios = redraw(key, i + 1, scenarios, belief)
+        return (learner, scenarios), (value, optax.tree.norm(gradient))
+
+    scenarios = draw(key, first, belief)
+    (learner, _), (values, norms) = jax.lax.scan(step, (learner, scenarios), first + jnp.arange(steps))
+    return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)

@@ -1,0 +1,177 @@
+"""The loop of Alg. 1 as three seams: collect (the plant), absorb (the data), improve (the mind)."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from pegasus_jax import dataset, episode
+from pegasus_jax.fit import FitInfo, fit
+from pegasus_jax.rollout import NoiseUse, rollout
+from pegasus_jax.scenarios import draw, redraw
+from pegasus_jax.search import SearchInfo, objective, optimise
+from pegasus_jax.types import (
+    Array,
+    Dynamics,
+    Experiment,
+    Key,
+    Learner,
+    Params,
+    Period,
+    Policy,
+    Rollout,
+    RunState,
+    Scenarios,
+    Task,
+    Trajectory,
+)
+
+# What the key of a trial is folded with, so that no two draws share a key.
+COLLECT, FIT, SEARCH, IMAGINE, EVALUATE = range(5)
+
+
+class TrialInfo(NamedTuple):
+    """What a trial of a whole-program study reports."""
+
+    trajectory: Trajectory  # the episode that became data
+    evaluation: Array  # [E, H] costs of episodes that did not
+    fit: FitInfo
+    search: SearchInfo
+
+
+def trial_key(key: Key, trial: Array | int, purpose: int) -> Key:
+    """The key of one purpose in one trial of the run with root key `key`."""
+    return jax.random.fold_in(jax.random.fold_in(key, trial), purpose)
+
+
+def experiment(
+    *,
+    task: Task,
+    dynamics: Dynamics,
+    policy: Policy,
+    blocks: Scenarios,
+    period: Period,
+    match: Callable[[Array, Array], Array],
+    cost: Callable[[Array], Array],
+    aggregate: Callable[[Array], Array],
+    noise: NoiseUse,
+    fit_optimizer: optax.GradientTransformation,
+    fit_steps: int,
+    fit_batch: int,
+    fit_reset: bool,
+    search_optimizer: optax.GradientTransformation,
+    search_steps: int,
+    search_reset: bool,
+    explore: Callable[[Key], Array],
+    explore_trials: int,
+    mean_execution: bool,
+    capacity: int,
+) -> Experiment:
+    """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned."""
+    states, controls = len(task.state_names), len(task.control_names)
+    pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, match=match, noise=noise)
+    scenario = dict(blocks=blocks, period=period)
+
+    def init(key: Key) -> RunState:
+        model_key, policy_key = jax.random.split(jax.random.fold_in(key, 0))
+        model, controller = dynamics.init(model_key), policy.init(policy_key)
+        return RunState(
+            key,
+            dataset.empty(capacity, states, controls),
+            Learner(model, fit_optimizer.init(model)),
+            Learner(controller, search_optimizer.init(controller)),
+            jnp.int32(0),
+        )
+
+    def act(params: Params, key: Key, x: Array) -> Array:
+        return policy.apply(params, None if mean_execution else policy.sample(key), x)
+
+    def evaluate(key: Key, policy_params: Params) -> Trajectory:
+        return episode.run(key, lambda k, t, x: act(policy_params, k, x), task)
+
+    def collect(state: RunState) -> Trajectory:
+        """The next episode: random controls in the first trials, the policy's afterwards (Alg. 1 line 3)."""
+        plan_key, run_key = jax.random.split(trial_key(state.key, state.trial + 1, COLLECT))
+        plan = explore(plan_key)
+        exploring = state.trial < explore_trials
+
+        def control(key: Key, t: Array, x: Array) -> Array:
+            return jnp.where(exploring, plan[t], act(state.policy.params, key, x))
+
+        return episode.run(run_key, control, task)
+
+    def absorb(state: RunState, trajectory: Trajectory) -> RunState:
+        """The run with one more episode in its data (Alg. 1 line 4)."""
+        return state._replace(data=dataset.add(state.data, trajectory, task.angles), trial=state.trial + 1)
+
+    def learn(state: RunState, steps: int = fit_steps) -> tuple[RunState, FitInfo]:
+        """Fit the model to the data (Alg. 1 line 5)."""
+        learner = state.model
+        if fit_reset:
+            learner = Learner(learner.params, fit_optimizer.init(learner.params))
+        learner, info = fit(
+            trial_key(state.key, state.trial, FIT),
+            learner,
+            state.data,
+            prepare=dynamics.prepare,
+            loss=dynamics.loss,
+            optimizer=fit_optimizer,
+            steps=steps,
+            batch=fit_batch,
+        )
+        return state._replace(model=learner), info
+
+    def search(state: RunState, first: Array | int = 0, steps: int = search_steps) -> tuple[RunState, SearchInfo]:
+        """Improve the policy in imagination (Alg. 1 line 6), from iteration `first` of the trial's search."""
+        learner = state.policy
+        if search_reset:
+            fresh = Learner(learner.params, search_optimizer.init(learner.params))
+            learner = jax.tree.map(partial(jnp.where, jnp.asarray(first) == 0), fresh, learner)
+        learner, info = optimise(
+            trial_key(state.key, state.trial, SEARCH),
+            learner,
+            dynamics.condition(state.model.params, state.data),
+            draw=partial(draw, **scenario),
+            redraw=partial(redraw, **scenario),
+            objective=partial(objective, **pieces, cost=cost, aggregate=aggregate),
+            optimizer=search_optimizer,
+            steps=steps,
+            first=first,
+        )
+        return state._replace(policy=learner), info
+
+    def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
+        state, fitted = learn(state)
+        state, searched = search(state)
+        return state, (fitted, searched)
+
+    def imagine(state: RunState) -> tuple[Rollout, Array]:
+        """Rollouts of the policy under scenarios the search has not seen, and their costs [H, K]."""
+        belief = dynamics.condition(state.model.params, state.data)
+        fresh = draw(trial_key(state.key, state.trial, IMAGINE), 0, belief, **scenario)
+        imagined = rollout(state.policy.params, belief, fresh, **pieces)
+        return imagined, cost(imagined.seen)
+
+    return Experiment(task, dynamics, policy, init, collect, absorb, learn, search, improve, evaluate, imagine)
+
+
+def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunState, TrialInfo]:
+    """One round of Alg. 1: collect, absorb, improve; then `episodes` evaluation episodes that are not data."""
+    trajectory = exp.collect(state)
+    state = exp.absorb(state, trajectory)
+    state, (fitted, searched) = exp.improve(state)
+    keys = jax.random.split(trial_key(state.key, state.trial, EVALUATE), episodes)
+    evaluation = jax.vmap(exp.evaluate, (0, None))(keys, state.policy.params)
+    return state, TrialInfo(trajectory, evaluation.cost, fitted, searched)
+
+
+def run(exp: Experiment, trials: int, episodes: int = 20) -> Callable[[Key], tuple[RunState, TrialInfo]]:
+    """key -> (state, TrialInfo [T, ...]): a whole run as one function; jit(vmap(run(...)))(keys) is a study."""
+
+    def whole(key: Key) -> tuple[RunState, TrialInfo]:
+        return jax.lax.scan(lambda state, _: trial(state, exp, episodes), exp.init(key), None, trials)
+
+    return whole

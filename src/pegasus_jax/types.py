@@ -1,0 +1,172 @@
+"""The vocabulary: every value that passes between the pieces, and the signature of every piece.
+
+Index letters, everywhere: K particles, H horizon, D state, U control, F encoded features, N dataset capacity,
+M minibatch, T trials, S seeds, E episodes. A piece that draws takes a `key`; a piece that takes noise is deterministic;
+none does both. A variant of a piece is another value of its type, never a subclass.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+import jax
+
+Array = jax.Array
+Key = jax.Array
+Params = Any  # a pytree of arrays, opaque to everyone but the piece that made it
+
+
+class Dataset(NamedTuple):
+    """Transitions (x_t, u_t) -> x_{t+1} - x_t in arrays of fixed capacity, so that nothing recompiles as data grows."""
+
+    x: Array  # [N, D] observed state
+    u: Array  # [N, U] control
+    y: Array  # [N, D] change of state; differences of angles are wrapped to (-pi, pi]
+    size: Array  # [] int32, rows in use; the rows beyond are zero
+
+
+class Batch(NamedTuple):
+    """Rows of a dataset."""
+
+    x: Array  # [M, D]
+    u: Array  # [M, U]
+    y: Array  # [M, D]
+
+
+class Trajectory(NamedTuple):
+    """One episode on a plant, as the controller saw it."""
+
+    x: Array  # [H+1, D] observed state
+    u: Array  # [H, U] control
+    cost: Array  # [H] cost of the states 1..H, without sensor noise where the plant can tell
+
+
+class Prediction(NamedTuple):
+    """A model's word on the next change of state."""
+
+    mean: Array  # [D] change of state
+    std: Array  # [D] standard deviation of the observation noise around it
+
+
+class Scenarios(NamedTuple):
+    """Every random number of K imagined rollouts: with these, a rollout is a deterministic function (PEGASUS)."""
+
+    start: Array  # [K, D] first states, Alg. 3 line 5
+    dynamics: Params  # [K, ...] one draw of the model a particle, Alg. 3 line 1
+    policy: Params  # [K, ...] one draw of the policy a particle, Alg. 3 line 2
+    sensor: Array  # [H, K, D] standard normal, scales the predicted noise
+    match: Array  # [H, K, D] standard normal, redraws matched particles, Alg. 3 line 3
+
+
+class Period(NamedTuple):
+    """For how many search iterations each draw is kept; 0 keeps it for the whole search of a trial.
+
+    Alg. 2 is 1 everywhere; Alg. 3 is start=1 and 0 elsewhere.
+    """
+
+    start: int = 1
+    dynamics: int = 0
+    policy: int = 0
+    sensor: int = 0
+    match: int = 0
+
+
+class Rollout(NamedTuple):
+    """K imagined trajectories."""
+
+    x: Array  # [H+1, K, D] states
+    u: Array  # [H, K, U] controls
+    std: Array  # [H, K, D] predicted noise of the states 1..H
+    seen: Array  # [H, K, D] the states 1..H as the cost sees them
+
+
+class Dropout(NamedTuple):
+    """Multiplicative noise on the units of a layer, h * z with z = mask(params, noise)."""
+
+    init: Callable[[Key, int], Params]  # (key, width) -> parameters of q(z)
+    sample: Callable[[Key, int], Array]  # (key, width) -> base noise [width], free of parameters
+    mask: Callable[[Params, Array], Array]  # (params, base noise [width]) -> z [width]
+    kl: Callable[[Params], Array]  # KL(q || prior) summed over units [nats]
+    retain: Callable[[Params], Array]  # E[z] [width]
+    decay: Callable[[Params], Array]  # [width] factor of |W_i|^2 / 2 in the weight prior of the unit's outgoing weights
+
+
+class Dynamics(NamedTuple):
+    """A distribution over functions (x, u) -> change of x, learned from data."""
+
+    init: Callable[[Key], Params]
+    prepare: Callable[[Dataset], Any]  # what the loss needs to know of the data set as a whole
+    loss: Callable[[Params, Key, Batch, Any], Array]  # (params, key, batch, prepare(data)) -> scalar
+    condition: Callable[[Params, Dataset], Any]  # -> belief, all that a rollout needs
+    sample: Callable[[Key, Any], Params]  # (key, belief) -> draw: one function, one particle's w^(k)
+    apply: Callable[[Any, Params, Array, Array], Prediction]  # (belief, draw, x [D], u [U])
+
+
+class Policy(NamedTuple):
+    """A controller; `apply` returns controls inside the plant's limits."""
+
+    init: Callable[[Key], Params]
+    sample: Callable[[Key], Params]  # base noise of one policy draw
+    apply: Callable[[Params, Params, Array], Array]  # (params, noise or None: the mean policy, x [D]) -> u [U]
+
+
+class Simulator(Protocol):
+    """What an episode needs of a plant that can be simulated; pegasus_envs.plant.Plant is one."""
+
+    @property
+    def reset(self) -> Callable[[Key], Any]: ...  # key -> physical state
+    @property
+    def step(self) -> Callable[[Any, Array], Any]: ...  # (state, u [U]) -> state one control period later
+    @property
+    def observe(self) -> Callable[[Any], Array]: ...  # state -> x [D]
+
+
+class Task(NamedTuple):
+    """What is to be learned: a plant's interface, a cost, and where episodes start."""
+
+    name: str
+    plant: Simulator | None  # None: somebody else (a robot, a Gymnasium environment) supplies the episodes
+    cost: Callable[[Array], Array]  # x [D] -> scalar in [0, 1]
+    angles: tuple[int, ...]  # the dimensions of x that are angles [rad]
+    start_mean: Any  # [D]
+    start_std: Any  # [D]
+    sensor_std: Any  # [D] noise added to what the policy and the data see
+    control_low: Any  # [U]
+    control_high: Any  # [U]
+    horizon: int  # H, control periods an episode
+    dt: float  # [s] control period
+    state_names: tuple[str, ...]
+    control_names: tuple[str, ...]
+    success: float = 0.2  # a rollout whose last five steps cost less than this on average has succeeded
+
+
+class Learner(NamedTuple):
+    """Parameters with the state of their optimiser."""
+
+    params: Params
+    optimizer: Any
+
+
+class RunState(NamedTuple):
+    """All that the next trial needs. The root key never changes: trial t uses fold_in(key, t), so resuming is exact."""
+
+    key: Key
+    data: Dataset
+    model: Learner
+    policy: Learner
+    trial: Array  # [] int32, episodes absorbed so far
+
+
+class Experiment(NamedTuple):
+    """One configured method on one task: pure functions, closed over their pieces by `build`."""
+
+    task: Task
+    dynamics: Dynamics
+    policy: Policy
+    init: Callable[[Key], RunState]
+    collect: Callable[[RunState], Trajectory]  # Alg. 1 line 3; the only one that touches the plant
+    absorb: Callable[[RunState, Trajectory], RunState]  # Alg. 1 line 4
+    fit: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 5
+    search: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 6
+    improve: Callable[[RunState], tuple[RunState, Any]]  # search after fit
+    evaluate: Callable[[Key, Params], Trajectory]  # one episode that is not data
+    imagine: Callable[[RunState], tuple[Rollout, Array]]  # fresh scenarios -> (rollout, cost [H, K])
