@@ -9,7 +9,6 @@ from pegasus_envs.physics import Motion, Scalar
 from pegasus_envs.plant import Plant, draw_start
 
 XML = "cartpole.xml"
-POLE, CART = 2, 1
 
 
 def cartpole(
@@ -72,19 +71,14 @@ def cartpole(
     )
 
 
-def _changes(length: Scalar, mass: Scalar, cart: Scalar, friction: Scalar, gravity: Scalar) -> dict:
-    """The fields of the model that the constants determine; the last three are for the eye only."""
+def _changes(length: Scalar, mass: Scalar, cart: Scalar, friction: Scalar, gravity: Scalar) -> list[physics.Change]:
+    """What the constants determine in the model; geoms are for the eye only."""
     model = physics.default(XML)
-    pole, tip, goal = (model.geom(name).id for name in ("pole", "tip", "goal"))
-    rod = mass * length**2 / 12.0
-    inertia = physics.put(physics.put(model.body_inertia, (POLE, 0), rod), (POLE, 1), rod)
-    visible = physics.put(model.geom_pos, (pole, 2), -0.5 * length)
-    visible = physics.put(visible, (tip, 2), -1.0 * length)
-    return {
-        "body_ipos": physics.put(model.body_ipos, (POLE, 2), -0.5 * length),
-        "body_inertia": inertia,
-        "body_mass": physics.put(physics.put(model.body_mass, POLE, mass), CART, cart),
-        "dof_damping": physics.put(model.dof_damping, 0, friction),
-        "geom_pos": physics.put(visible, (goal, 2), length),
-        "geom_size": physics.put(model.geom_size, (pole, 1), 0.5 * length),
-    }
+    return [
+        *physics.uniform_rod(model, "pole", length, mass, up=-1.0),
+        ("geom_pos", (model.geom("tip").id, 2), -1.0 * length),
+        ("geom_pos", (model.geom("goal").id, 2), length),
+        ("body_mass", model.body("cart").id, cart),
+        ("dof_damping", 0, friction),
+        ("opt.gravity", 2, -1.0 * gravity),
+    ]

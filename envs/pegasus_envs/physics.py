@@ -10,7 +10,9 @@ needs. The physics is MJX's own, and tests hold it to `mjx.step` and to C MuJoCo
 # (MuJoCo's bindings and MJX's data classes declare few of their names.)
 
 import copy
+from collections.abc import Iterable
 from functools import cache
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -37,6 +39,9 @@ class Motion(NamedTuple):
 
 Scalar = float | Array
 """A physical constant, traced or not."""
+
+Change = tuple[str, Any, Any]
+"""a field of MuJoCo's model, an index into it, the value to put there"""
 
 _Stage = tuple[Array, Array, Array, Array]
 """velocity and acceleration of the last stage, their weighted means so far: each [nv]"""
@@ -67,19 +72,27 @@ def _on_device(name: str, x64: bool) -> tuple[Any, Any]:
         return mjx.put_model(_compiled(name), impl="jax"), mjx.make_data(_compiled(name), impl="jax")
 
 
-def load(name: str, changes: dict[str, Any] | None = None) -> Physics:
-    """Read `assets/name`, then overwrite fields of the model with the given arrays, which may be traced.
+def load(name: str, changes: Iterable[Change] = ()) -> Physics:
+    """Read `assets/name`, then overwrite entries of the model's fields by values, which may be traced.
 
     The host's copy changes too, unless a value is traced: then it keeps the file's constants.
     """
-    changes = changes or {}
     device, blank = _on_device(name, bool(jax.config.jax_enable_x64))
-    device = device.replace(**{field: jnp.asarray(value, float) for field, value in changes.items()})
     host = copy.copy(_compiled(name))
-    if not any(isinstance(value, jax.core.Tracer) for value in changes.values()):
-        for field, value in changes.items():
-            getattr(host, field)[:] = np.asarray(value)
+    fields = {}
+    for field, index, value in changes:
+        fields[field] = _put(fields.get(field, attrgetter(field)(_compiled(name))), index, value)
+    device = device.tree_replace({field: jnp.asarray(value, float) for field, value in fields.items()})
+    if not any(isinstance(value, jax.Array) for value in fields.values()):
+        for field, value in fields.items():
+            _write(host, field, value)
     return Physics(device, blank, host)
+
+
+def _write(host: mujoco.MjModel, field: str, value: np.ndarray) -> None:
+    *path, name = field.split(".")
+    owner = attrgetter(".".join(path))(host) if path else host
+    setattr(owner, name, value if value.ndim else value.item())
 
 
 def default(name: str) -> mujoco.MjModel:
@@ -87,7 +100,19 @@ def default(name: str) -> mujoco.MjModel:
     return _compiled(name)
 
 
-def put(array: Any, index: Any, value: Any) -> Any:
+def uniform_rod(model: mujoco.MjModel, name: str, length: Scalar, mass: Scalar, up: float) -> list[Change]:
+    """What length [m] and mass [kg] of a thin rod determine, for a body and its geom of that name; up is 1 or -1."""
+    body, geom = model.body(name).id, model.geom(name).id
+    return [
+        ("body_mass", body, mass),
+        ("body_ipos", (body, 2), up * 0.5 * length),
+        ("body_inertia", (body, slice(0, 2)), mass * length**2 / 12.0),
+        ("geom_pos", (geom, 2), up * 0.5 * length),
+        ("geom_size", (geom, 1), 0.5 * length),
+    ]
+
+
+def _put(array: Any, index: Any, value: Any) -> Any:
     """A copy of `array` with `value` at `index`; a JAX array only if one of the two is."""
     if isinstance(value, jax.Array) or isinstance(array, jax.Array):
         return jnp.asarray(array, float).at[index].set(value)
@@ -134,8 +159,8 @@ def rotate(quaternion: Array, turn: Array) -> Array:
     return turned / jnp.sqrt(turned @ turned)
 
 
-def runge_kutta(physics: Physics, motion: Motion, control: Array) -> Motion:
-    """One time step of the model's length, with the actuator commands [nu] held."""
+def runge_kutta(physics: Physics, motion: Motion, control: Array) -> tuple[Array, Array]:
+    """Mean velocity and acceleration [nv] over one time step of the model, with the actuator commands [nu] held."""
     step = physics.host.opt.timestep
 
     def stage(carry: _Stage, tableau: Array) -> tuple[_Stage, None]:
@@ -149,16 +174,41 @@ def runge_kutta(physics: Physics, motion: Motion, control: Array) -> Motion:
     zero = jnp.zeros_like(motion.qvel)
     tableau = jnp.asarray(np.stack([_OFFSETS, _WEIGHTS], axis=1), motion.qvel.dtype)
     (_, _, velocity, slope), _ = jax.lax.scan(stage, (zero, zero, zero, zero), tableau)
+    return velocity, slope
+
+
+def advance(physics: Physics, motion: Motion, control: Array) -> Motion:
+    """The motion one time step of the model later."""
+    step = physics.host.opt.timestep
+    velocity, slope = runge_kutta(physics, motion, control)
     return Motion(displace(physics, motion.qpos, velocity, step), motion.qvel + step * slope)
 
 
 def hold(physics: Physics, motion: Motion, control: Array, dt: float) -> Motion:
-    """The motion one control period [s] later, under held actuator commands [nu]."""
+    """The motion one control period [s] later, under held actuator commands [nu]; for mechanisms of plain joints.
 
-    def advance(motion: Motion, _: None) -> tuple[Motion, None]:
-        return runge_kutta(physics, motion, control), None
+    The sums over the many short steps are compensated: in single precision their rounding, amplified by a chaotic
+    mechanism, would else be the largest error by an order of magnitude.
+    """
+    step = physics.host.opt.timestep
 
-    return jax.lax.scan(advance, motion, None, length=substeps(physics, dt))[0]
+    def substep(carry: tuple[Motion, Motion], _: None) -> tuple[tuple[Motion, Motion], None]:
+        motion, lost = carry
+        velocity, slope = runge_kutta(physics, motion, control)
+        qpos, lost_qpos = _add(motion.qpos, lost.qpos, step * velocity)
+        qvel, lost_qvel = _add(motion.qvel, lost.qvel, step * slope)
+        return (Motion(qpos, qvel), Motion(lost_qpos, lost_qvel)), None
+
+    start = (motion, jax.tree.map(jnp.zeros_like, motion))
+    (motion, _), _ = jax.lax.scan(substep, start, None, length=substeps(physics, dt))
+    return motion
+
+
+def _add(total: Array, lost: Array, increment: Array) -> tuple[Array, Array]:
+    """Kahan's sum: the new total, and what its rounding left out."""
+    increment = increment + lost
+    result = total + increment
+    return result, increment - (result - total)
 
 
 def substeps(physics: Physics, dt: float) -> int:
