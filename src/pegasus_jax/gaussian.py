@@ -139,8 +139,8 @@ def squash(mean: Array, cov: Array, low: Array | float = -1.0, high: Array | flo
     `low` and `high` are scalars or [U]. Exact (PILCO's gSat).
     """
     size = mean.shape[0]
-    half = jnp.broadcast_to((jnp.asarray(high, mean.dtype) - low) / 2, (size,))
-    middle = (jnp.asarray(high, mean.dtype) + low) / 2
+    low, high = jnp.asarray(low, mean.dtype), jnp.asarray(high, mean.dtype)
+    half, middle = jnp.broadcast_to((high - low) / 2, (size,)), (high + low) / 2
     times = jnp.repeat(jnp.array([1.0, 3.0], mean.dtype), size)
     amplitude = jnp.repeat(jnp.array([9.0, 1.0], mean.dtype) / 8, size) * jnp.tile(half, 2)
     angle = times * jnp.tile(mean, 2)
@@ -249,15 +249,15 @@ def ssgp_moments(
     even, odd = first * cosine + second * sine, second * cosine - first * sine
     damping = jnp.exp(-0.5 * variance)
 
-    def pair(a: Array, b: Array) -> tuple[Array, Array, Array]:
-        return _wave_moments(variance[a][:, None], variance[b][None, :], frequencies[a] @ cov @ frequencies[b].T)
-
     def covariance(a: Array, b: Array) -> Array:
-        _, cosines, sines = pair(a, b)
+        phase_cov = frequencies[a] @ cov @ frequencies[b].T
+        _, cosines, sines = _wave_moments(variance[a][:, None], variance[b][None, :], phase_cov)
         return even[a] @ cosines @ even[b] + odd[a] @ sines @ odd[b]
 
     def own_variance(a: Array) -> Array:
-        second_moment, cosines, sines = pair(a, a)
+        phase_cov = frequencies[a] @ cov @ frequencies[a].T
+        own = jnp.diagonal(phase_cov)  # not variance[a]: equal to the last bit where waves are much damped
+        second_moment, cosines, sines = _wave_moments(own[:, None], own[None, :], phase_cov)
         explained = even[a] @ cosines @ even[a] + odd[a] @ sines @ odd[a]
         if weight_cov is None:
             return explained
