@@ -74,7 +74,7 @@ def test_shapes_and_dtype(name):
             assert kind.kl(params).shape == ()
             assert jnp.broadcast_shapes(kind.retain(params).shape, (WIDTH,)) == (WIDTH,)
             z = kind.mask(params, noise)
-            np.testing.assert_allclose(z, jax.vmap(lambda row: kind.mask(params, row))(noise), rtol=1e-5)  # noqa: B023
+            np.testing.assert_allclose(z[3], kind.mask(params, noise[3]), rtol=1e-5)
             for leaf in (*jax.tree.leaves(params), noise, z, kind.kl(params), kind.retain(params)):
                 assert leaf.dtype == dtype
 
@@ -100,6 +100,7 @@ def test_gradients_against_finite_differences(name, x64):
         "retain": lambda p: jnp.sum(kind.retain(p) * weight[0]),
     }
     for what, value in values.items():
+        value = jax.jit(value)
         gradient = jax.grad(value)(params)
         for leaf in params:
             for unit in range(WIDTH):

@@ -15,12 +15,12 @@ ROOT = Path(__file__).resolve().parents[1]
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
     0: "types config",
-    1: "angles dropout whiten moments cost dataset scenarios rollout episode",
+    1: "angles dropout whiten moments gaussian cost dataset scenarios rollout episode",
     2: "network fit search",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",
-    6: "checkpoint record report. cli progress settings study __main__ __init__",
+    6: "checkpoint record report. cli progress settings train study __main__ __init__",
 }
 TOP = max(LAYERS)  # the layer that is an application: here modules may import each other, without cycles
 

@@ -1,6 +1,6 @@
 """Every setting, typed, with its default and its limits. Frozen and hashable: a config is a key.
 
-The first line of a field's comment is its help text. Values are checked when a config is made, and a bad one raises
+Values are checked when a config is made, and a bad one raises
 `SettingError` with one line that names the setting, the value and what was expected.
 """
 
@@ -44,6 +44,11 @@ def _layers(name: str, value: Any) -> tuple[int, ...]:
     return layers
 
 
+def setting(default: Any, text: str) -> Any:
+    """A field with its help text."""
+    return field(default=default, metadata={"help": text})
+
+
 DROPOUTS = ("log_normal", "binary", "concrete", "gaussian", "sparse", "none")
 HEADS = ("sigmoid", "softplus")
 INITIALISERS = ("glorot", "orthogonal")
@@ -57,17 +62,17 @@ EXECUTIONS = ("sampled", "mean")
 class BNN:
     """Bayesian neural network dynamics."""
 
-    hidden: tuple[int, ...] = (200, 200)  # widths of the hidden layers
-    dropout: str = "log_normal"  # noise on the units: log_normal, binary, concrete, gaussian, sparse, none
-    rate: float = 0.1  # drop probability of binary dropout, initial one of concrete dropout
-    low: float = -10.0  # lower end of the interval of log z (log_normal)
-    high: float = 0.0  # upper end of the interval of log z (log_normal)
-    input_noise: bool = False  # noise on the network's own inputs as well
-    heteroscedastic: bool = True  # predicted noise depends on the input
-    head: str = "sigmoid"  # form of the predicted noise: sigmoid (at most .1 of the target's scale), softplus
-    whitening: str = "full"  # scaling of inputs and targets: full covariance, or diagonal
-    weight_decay: float = 1.0  # factor of the Gaussian prior on the weights
-    initialiser: str = "glorot"  # initial weights: glorot, orthogonal
+    hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
+    dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
+    rate: float = setting(0.1, "drop probability of binary dropout, initial one of concrete dropout")
+    low: float = setting(-10.0, "lower end of the interval of log z (log_normal)")
+    high: float = setting(0.0, "upper end of the interval of log z (log_normal)")
+    input_noise: bool = setting(False, "noise on the network's own inputs as well")
+    heteroscedastic: bool = setting(True, "predicted noise depends on the input")
+    head: str = setting("sigmoid", "form of the predicted noise: sigmoid (at most .1 of the target's scale), softplus")
+    whitening: str = setting("full", "scaling of inputs and targets: full covariance, or diagonal")
+    weight_decay: float = setting(1.0, "factor of the Gaussian prior on the weights")
+    initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", _layers("model.hidden", self.hidden))
@@ -85,12 +90,12 @@ class BNN:
 class MLP:
     """A ReLU network controller."""
 
-    hidden: tuple[int, ...] = (200, 200)  # widths of the hidden layers
-    dropout: float = 0.1  # drop probability of the hidden units; 0 is a deterministic policy
-    squash: str = "tanh"  # saturation: tanh, or sine, (9 sin v + sin 3v)/8
-    execution: str = "sampled"  # on the plant: sampled (a fresh mask each step, explores), or mean
-    output_scale: float = 1.0  # factor of the last layer's initial weights
-    initialiser: str = "glorot"  # initial weights: glorot, orthogonal
+    hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
+    dropout: float = setting(0.1, "drop probability of the hidden units; 0 is a deterministic policy")
+    squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
+    execution: str = setting("sampled", "on the plant: sampled (a fresh mask each step, explores), or mean")
+    output_scale: float = setting(1.0, "factor of the last layer's initial weights")
+    initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", _layers("policy.hidden", self.hidden))
@@ -105,10 +110,10 @@ class MLP:
 class Fit:
     """Model learning after each trial."""
 
-    steps: int = 2000  # updates a trial
-    batch: int = 100  # rows an update
-    learning_rate: float = 1e-4  # Adam's step size
-    reset: bool = False  # forget Adam's moments at each trial
+    steps: int = setting(2000, "updates a trial")
+    batch: int = setting(100, "rows an update")
+    learning_rate: float = setting(1e-4, "Adam's step size")
+    reset: bool = setting(False, "forget Adam's moments at each trial")
 
     def __post_init__(self) -> None:
         _within("fit.steps", self.steps, 1)
@@ -120,11 +125,11 @@ class Fit:
 class Period:
     """For how many iterations each draw of the scenarios is kept; 0: the whole search of a trial."""
 
-    start: int = 1  # first states
-    dynamics: int = 0  # draws of the model
-    policy: int = 0  # draws of the policy
-    sensor: int = 0  # noise on what the policy sees
-    match: int = 0  # noise of the moment matching
+    start: int = setting(1, "first states")
+    dynamics: int = setting(0, "draws of the model")
+    policy: int = setting(0, "draws of the policy")
+    sensor: int = setting(0, "noise on what the policy sees")
+    match: int = setting(0, "noise of the moment matching")
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):
@@ -135,19 +140,19 @@ class Period:
 class Search:
     """Policy search after each fit."""
 
-    steps: int = 1000  # iterations a trial
-    particles: int = 100  # K, imagined rollouts an iteration
-    learning_rate: float = 1e-3  # Adam's step size
-    clip: float | None = 1.0  # largest global norm of the gradient; null: no clipping
-    match: bool = True  # moment matching
-    balanced: bool = False  # make the drawn noise exactly zero mean, unit covariance over the particles
-    aggregate: str = "mean"  # over the horizon: mean (authors' code) or total (the paper's sum)
-    discount: float = 1.0  # weight of a later step against the one before
-    reset: bool = True  # forget Adam's moments at each trial
-    policy_noise: float = 1.0  # factor of the predicted noise on what the policy sees
-    state_noise: float = 0.0  # factor of the predicted noise added to the state
-    cost_noise: float = 0.0  # factor of the predicted noise on what the cost sees
-    period: Period = field(default_factory=Period)
+    steps: int = setting(1000, "iterations a trial")
+    particles: int = setting(100, "K, imagined rollouts an iteration")
+    learning_rate: float = setting(1e-3, "Adam's step size")
+    clip: float | None = setting(1.0, "largest global norm of the gradient; null: no clipping")
+    match: bool = setting(True, "moment matching")
+    balanced: bool = setting(False, "make the drawn noise exactly zero mean, unit covariance over the particles")
+    aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
+    discount: float = setting(1.0, "weight of a later step against the one before")
+    reset: bool = setting(True, "forget Adam's moments at each trial")
+    policy_noise: float = setting(1.0, "factor of the predicted noise on what the policy sees")
+    state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
+    cost_noise: float = setting(0.0, "factor of the predicted noise on what the cost sees")
+    period: Period = Period()
 
     def __post_init__(self) -> None:
         _within("search.steps", self.steps, 1)
@@ -165,8 +170,8 @@ class Search:
 class Explore:
     """The first episodes, before there is a model."""
 
-    trials: int = 1  # episodes of random controls
-    kind: str = "uniform"  # uniform: a fresh control each step; walk: a random walk
+    trials: int = setting(1, "episodes of random controls")
+    kind: str = setting("uniform", "uniform: a fresh control each step; walk: a random walk")
 
     def __post_init__(self) -> None:
         _within("explore.trials", self.trials, 0)
@@ -177,15 +182,38 @@ class Explore:
 class Config:
     """One run."""
 
-    task: str = "cartpole"  # what to learn
-    seed: int = 0  # all randomness of the run comes from it
-    trials: int = 15  # episodes on the plant, the random ones included
-    model: BNN = field(default_factory=BNN)
-    policy: MLP = field(default_factory=MLP)
-    fit: Fit = field(default_factory=Fit)
-    search: Search = field(default_factory=Search)
-    explore: Explore = field(default_factory=Explore)
+    task: str = setting("cartpole", "what to learn")
+    seed: int = setting(0, "all randomness of the run comes from it")
+    trials: int = setting(15, "episodes on the plant, the random ones included")
+    model: BNN = BNN()
+    policy: MLP = MLP()
+    fit: Fit = Fit()
+    search: Search = Search()
+    explore: Explore = Explore()
 
     def __post_init__(self) -> None:
         _within("seed", self.seed, 0, 2**32 - 1)
         _within("trials", self.trials, 1, 10_000)
+
+
+# The named variants that `model=`, `policy=` and `algorithm=` select.
+MODELS: dict[str, BNN] = {
+    "log_normal": BNN(),
+    "binary": BNN(dropout="binary"),
+    "concrete": BNN(dropout="concrete"),
+    "gaussian": BNN(dropout="gaussian"),
+    "sparse": BNN(dropout="sparse"),
+    "deterministic": BNN(dropout="none"),
+}
+POLICIES: dict[str, MLP] = {
+    "dropout_mlp": MLP(),
+    "mlp": MLP(dropout=0.0),
+}
+ALGORITHMS: dict[str, dict[str, Any]] = {
+    "pegasus": {},
+    "deep_pilco": {  # Alg. 2
+        "search.particles": 10,
+        "search.clip": None,
+        "search.period": {"start": 1, "dynamics": 1, "policy": 1, "sensor": 1, "match": 1},
+    },
+}

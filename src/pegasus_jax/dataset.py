@@ -28,6 +28,13 @@ def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...]) -> Datas
     )
 
 
+def grow(data: Dataset, capacity: int) -> Dataset:
+    """The same data with room for `capacity` rows, at least as many as now."""
+    more = capacity - data.x.shape[0]
+    x, u, y = (jnp.pad(rows, ((0, more), (0, 0))) for rows in data[:3])
+    return Dataset(x, u, y, data.size)
+
+
 def minibatch(key: Key, data: Dataset, rows: int) -> Batch:
     """`rows` rows drawn with replacement from those in use."""
     index: Array = jax.random.randint(key, (rows,), 0, data.size)

@@ -1,6 +1,7 @@
 """The only place that draws the noise of imagined rollouts."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -8,11 +9,23 @@ import jax.numpy as jnp
 from pegasus_jax.moments import standardise
 from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, Scenarios
 
+Block = Callable[[Key, Params], Params]  # (key, belief) -> that part of the scenarios
+
+
+class Blocks(NamedTuple):
+    """How each part of the scenarios is drawn."""
+
+    start: Block
+    dynamics: Block
+    policy: Block
+    sensor: Block
+    match: Block
+
 
 def blocks(
     *, dynamics: Dynamics, policy: Policy, start: Callable[[Key], Array], particles: int, horizon: int, balanced: bool
-) -> Scenarios:
-    """How each block of the scenarios is drawn: a Scenarios of functions (key, belief) -> block.
+) -> Blocks:
+    """How each part of the scenarios is drawn.
 
     With `balanced`, the normal draws of every time step have exactly zero mean and unit covariance over the particles,
     so that matched particles have exactly the moments asked for.
@@ -26,7 +39,7 @@ def blocks(
         z = jax.random.normal(key, (horizon, particles, states))
         return standardise(z) if balanced else z
 
-    return Scenarios(
+    return Blocks(
         start=lambda key, _: each(start)(key),
         dynamics=lambda key, belief: each(lambda k: dynamics.sample(k, belief))(key),
         policy=lambda key, _: each(policy.sample)(key),
@@ -35,7 +48,7 @@ def blocks(
     )
 
 
-def draw(key: Key, step: Array | int, belief: Params, *, blocks: Scenarios, period: Period) -> Scenarios:
+def draw(key: Key, step: Array | int, belief: Params, *, blocks: Blocks, period: Period) -> Scenarios:
     """The scenarios in force at a search iteration.
 
     Block b at iteration i is drawn from fold_in(fold_in(key, b), i // period_b): any iteration's scenarios can be had
@@ -48,9 +61,7 @@ def draw(key: Key, step: Array | int, belief: Params, *, blocks: Scenarios, peri
     return Scenarios(*(one(i, *pair) for i, pair in enumerate(zip(blocks, period, strict=True))))
 
 
-def redraw(
-    key: Key, step: Array, scenarios: Scenarios, belief: Params, *, blocks: Scenarios, period: Period
-) -> Scenarios:
+def redraw(key: Key, step: Array, scenarios: Scenarios, belief: Params, *, blocks: Blocks, period: Period) -> Scenarios:
     """`draw` for the iteration after the one whose scenarios are given; draws only the blocks that change."""
     renewed = {}
     for every in sorted(set(period) - {0}):

@@ -34,9 +34,7 @@ def objective(
     noise: NoiseUse = NoiseUse(),
 ) -> Array:
     """J(theta) (Alg. 3 line 16): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
-    imagined = rollout(
-        policy_params, belief, scenarios, dynamics=dynamics, policy=policy, match=match, noise=noise
-    )
+    imagined = rollout(policy_params, belief, scenarios, dynamics=dynamics, policy=policy, match=match, noise=noise)
     return aggregate(cost(imagined.seen))
 
 

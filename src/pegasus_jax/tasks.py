@@ -5,7 +5,6 @@ from typing import Any
 
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.plant import Plant
-
 from pegasus_jax.config import SettingError, nearest
 from pegasus_jax.cost import saturating
 from pegasus_jax.types import Task

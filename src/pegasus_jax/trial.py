@@ -11,7 +11,7 @@ import optax
 from pegasus_jax import dataset, episode
 from pegasus_jax.fit import FitInfo, fit
 from pegasus_jax.rollout import NoiseUse, rollout
-from pegasus_jax.scenarios import draw, redraw
+from pegasus_jax.scenarios import Blocks, draw, redraw
 from pegasus_jax.search import SearchInfo, objective, optimise
 from pegasus_jax.types import (
     Array,
@@ -24,7 +24,6 @@ from pegasus_jax.types import (
     Policy,
     Rollout,
     RunState,
-    Scenarios,
     Task,
     Trajectory,
 )
@@ -52,7 +51,7 @@ def experiment(
     task: Task,
     dynamics: Dynamics,
     policy: Policy,
-    blocks: Scenarios,
+    blocks: Blocks,
     period: Period,
     match: Callable[[Array, Array], Array],
     cost: Callable[[Array], Array],
@@ -73,7 +72,7 @@ def experiment(
     """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned."""
     states, controls = len(task.state_names), len(task.control_names)
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, match=match, noise=noise)
-    scenario = dict(blocks=blocks, period=period)
+    scenario: dict[str, Any] = dict(blocks=blocks, period=period)
 
     def init(key: Key) -> RunState:
         model_key, policy_key = jax.random.split(jax.random.fold_in(key, 0))
@@ -89,19 +88,20 @@ def experiment(
     def act(params: Params, key: Key, x: Array) -> Array:
         return policy.apply(params, None if mean_execution else policy.sample(key), x)
 
-    def evaluate(key: Key, policy_params: Params) -> Trajectory:
-        return episode.run(key, lambda k, t, x: act(policy_params, k, x), task)
+    def one_episode(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
+        """An episode of the policy, or of random controls. One function, because a plant is slow to compile."""
+        plan_key, run_key = jax.random.split(key)
+        plan = explore(plan_key)
+
+        def control(key: Key, t: Array, x: Array) -> Array:
+            return jnp.where(exploring, plan[t], act(policy_params, key, x))
+
+        return episode.run(run_key, control, task)
 
     def collect(state: RunState) -> Trajectory:
         """The next episode: random controls in the first trials, the policy's afterwards (Alg. 1 line 3)."""
-        plan_key, run_key = jax.random.split(trial_key(state.key, state.trial + 1, COLLECT))
-        plan = explore(plan_key)
-        exploring = state.trial < explore_trials
-
-        def control(key: Key, t: Array, x: Array) -> Array:
-            return jnp.where(exploring, plan[t], act(state.policy.params, key, x))
-
-        return episode.run(run_key, control, task)
+        key = trial_key(state.key, state.trial + 1, COLLECT)
+        return one_episode(key, state.policy.params, state.trial < explore_trials)
 
     def absorb(state: RunState, trajectory: Trajectory) -> RunState:
         """The run with one more episode in its data (Alg. 1 line 4)."""
@@ -155,7 +155,7 @@ def experiment(
         imagined = rollout(state.policy.params, belief, fresh, **pieces)
         return imagined, cost(imagined.seen)
 
-    return Experiment(task, dynamics, policy, init, collect, absorb, learn, search, improve, evaluate, imagine)
+    return Experiment(task, dynamics, policy, init, one_episode, collect, absorb, learn, search, improve, imagine)
 
 
 def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunState, TrialInfo]:
@@ -164,7 +164,7 @@ def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunStat
     state = exp.absorb(state, trajectory)
     state, (fitted, searched) = exp.improve(state)
     keys = jax.random.split(trial_key(state.key, state.trial, EVALUATE), episodes)
-    evaluation = jax.vmap(exp.evaluate, (0, None))(keys, state.policy.params)
+    evaluation = jax.vmap(exp.episode, (0, None, None))(keys, state.policy.params, False)
     return state, TrialInfo(trajectory, evaluation.cost, fitted, searched)
 
 

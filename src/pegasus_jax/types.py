@@ -6,7 +6,7 @@ none does both. A variant of a piece is another value of its type, never a subcl
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 
@@ -109,22 +109,13 @@ class Policy(NamedTuple):
     apply: Callable[[Params, Params, Array], Array]  # (params, noise or None: the mean policy, x [D]) -> u [U]
 
 
-class Simulator(Protocol):
-    """What an episode needs of a plant that can be simulated; pegasus_envs.plant.Plant is one."""
-
-    @property
-    def reset(self) -> Callable[[Key], Any]: ...  # key -> physical state
-    @property
-    def step(self) -> Callable[[Any, Array], Any]: ...  # (state, u [U]) -> state one control period later
-    @property
-    def observe(self) -> Callable[[Any], Array]: ...  # state -> x [D]
-
-
 class Task(NamedTuple):
     """What is to be learned: a plant's interface, a cost, and where episodes start."""
 
     name: str
-    plant: Simulator | None  # None: somebody else (a robot, a Gymnasium environment) supplies the episodes
+    # reset(key) -> state; step(state, u [U]) -> state; observe(state) -> x [D]. None: somebody else, a robot or a
+    # Gymnasium environment, supplies the episodes.
+    plant: Any
     cost: Callable[[Array], Array]  # x [D] -> scalar in [0, 1]
     angles: tuple[int, ...]  # the dimensions of x that are angles [rad]
     start_mean: Any  # [D]
@@ -163,10 +154,10 @@ class Experiment(NamedTuple):
     dynamics: Dynamics
     policy: Policy
     init: Callable[[Key], RunState]
-    collect: Callable[[RunState], Trajectory]  # Alg. 1 line 3; the only one that touches the plant
+    episode: Callable[[Key, Params, Array | bool], Trajectory]  # (key, policy parameters, random controls?)
+    collect: Callable[[RunState], Trajectory]  # Alg. 1 line 3; with `episode`, the only one that touches the plant
     absorb: Callable[[RunState, Trajectory], RunState]  # Alg. 1 line 4
     fit: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 5
     search: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 6
     improve: Callable[[RunState], tuple[RunState, Any]]  # search after fit
-    evaluate: Callable[[Key, Params], Trajectory]  # one episode that is not data
     imagine: Callable[[RunState], tuple[Rollout, Array]]  # fresh scenarios -> (rollout, cost [H, K])

@@ -1,7 +1,7 @@
 """Bayesian neural network dynamics: a ReLU network with multiplicative noise on its units (paper, section IV-C)."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -83,7 +83,7 @@ def bnn(
 
     def predict(belief: Belief, masks: list[Array | None], x: Array, u: Array) -> Prediction:
         params, scaling = belief
-        out = network.apply(params["network"], whiten(scaling.inputs, inputs_of(x, u)), masks)
+        out: Any = network.apply(params["network"], whiten(scaling.inputs, inputs_of(x, u)), masks)
         raw = out[..., states:] if heteroscedastic else jnp.broadcast_to(params["raw_std"], out.shape)
         scale = jnp.diagonal(scaling.targets.root)
         return Prediction(unwhiten(scaling.targets, out[..., :states]), head(raw) * scale)
@@ -94,8 +94,7 @@ def bnn(
         keys = jax.random.split(key, len(kinds))
         # Base noise is independent over units, so that of M rows is that of one layer M times as wide.
         noise = tuple(
-            k.sample(kk, rows * w).reshape(rows, w) if k else None
-            for k, kk, w in zip(kinds, keys, widths, strict=True)
+            k.sample(kk, rows * w).reshape(rows, w) if k else None for k, kk, w in zip(kinds, keys, widths, strict=True)
         )
         mean, std = predict(Belief(params, scaling), masks_of(params, noise), batch.x, batch.u)
         misfit = jnp.sum(0.5 * ((batch.y - mean) / std) ** 2 + jnp.log(std), -1)
@@ -103,7 +102,7 @@ def bnn(
 
     def penalty(params: Params) -> Array:
         kl = sum(k.kl(p) for k, p in zip(kinds, params["noise"], strict=True) if k)
-        prior = 0.0
+        prior = jnp.zeros(())
         for i, (kind, noise) in enumerate(zip(kinds, params["noise"], strict=True)):
             layer = params["network"]["params"][f"layer_{i}"]
             retained = kind.decay(noise) if kind else jnp.ones(widths[i])

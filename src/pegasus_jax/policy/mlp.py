@@ -1,6 +1,7 @@
 """A ReLU network controller, with multiplicative noise on its hidden units or without."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +31,7 @@ def mlp(
 
     def init(key: Key) -> Params:
         net_key, *keys = jax.random.split(key, 1 + len(hidden))
-        net = network.init(net_key, jnp.zeros(features), [None] * (len(hidden) + 1))
+        net: Any = network.init(net_key, jnp.zeros(features), [None] * (len(hidden) + 1))
         last = f"layer_{len(hidden)}"
         net["params"][last]["kernel"] = net["params"][last]["kernel"] * output_scale
         return {"network": net, "noise": tuple(dropout.init(k, w) for k, w in zip(keys, hidden, strict=True))}
@@ -45,6 +46,7 @@ def mlp(
             masks = [dropout.retain(p) for p in params["noise"]]
         else:
             masks = [dropout.mask(p, z) for p, z in zip(params["noise"], noise, strict=True)]
-        return saturate(network.apply(params["network"], encode(x) * input_scale, [None, *masks]))
+        out: Any = network.apply(params["network"], encode(x) * input_scale, [None, *masks])
+        return saturate(out)
 
     return Policy(init, sample, apply)

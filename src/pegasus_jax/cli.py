@@ -1,0 +1,174 @@
+"""The commands: pegasus-train, pegasus-eval, pegasus-plot. Each reads `key=value` words and ends with 0, 1 or 2."""
+
+import json
+import os
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pegasus_jax.config import Config, SettingError
+
+TRAIN = """\
+pegasus-train task=NAME [setting=value ...]     learn a controller
+pegasus-train resume=RUN [trials=N]             go on with a run, also one that was killed
+
+  task=cartpole         what to learn: {tasks}
+  model=log_normal      dynamics model: {models}
+  policy=dropout_mlp    controller: {policies}
+  algorithm=pegasus     how to search: {algorithms}
+  out=runs/...          the run's folder (default: runs/TASK-seedN)
+
+A named variant brings its defaults; the settings below change them one by one.
+{settings}
+
+examples
+  pegasus-train task=cartpole
+  pegasus-train task=cartpole policy.hidden=[50,50] seed=3 trials=10 out=runs/demo
+  pegasus-train task=cartpole algorithm=deep_pilco search.clip=1
+  pegasus-train resume=runs/demo trials=20
+
+Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, or tensorboard --logdir RUN/tensorboard.
+"""
+
+EVALUATE = """\
+pegasus-eval RUN [episodes=20] [seed=0] [json=true]     run a learned policy on its plant
+
+Uses the newest whole checkpoint of the run, finished or not, and episodes that never become data.
+Prints mean cost per step, success rate (last five steps cost less than .2 on average) and the run's fingerprint:
+SHA-256 over data, model and policy parameters. With json=true, one JSON object.
+"""
+
+PLOT = """\
+pegasus-plot RUN     draw a run, finished or not
+
+Writes RUN/plots/learning.png (cost and success against plant time) and RUN/plots/trial_NNNN.png for every trial:
+states, force and cost of the imagined particles after that trial, and over them what the plant did next.
+"""
+
+
+def train() -> None:
+    """Entry point of pegasus-train."""
+    _main(_train, TRAIN)
+
+
+def evaluate() -> None:
+    """Entry point of pegasus-eval."""
+    _main(_evaluate, EVALUATE)
+
+
+def plot() -> None:
+    """Entry point of pegasus-plot."""
+    _main(_plot, PLOT)
+
+
+def _train(words: Sequence[str]) -> None:
+    from pegasus_jax import record, settings
+
+    options, rest = settings.split(words, ("out", "resume"))
+    command = shlex.join(["pegasus-train", *words])
+    if "resume" in options:
+        if wrong := sorted(({*rest} | {*options}) - {"resume", "trials"}):
+            raise SettingError(f"{wrong[0]} cannot be changed by resume=; only trials= can")
+        run = record.existing(Path(options["resume"]))
+        config = settings.override(settings.load(run / "config.yaml"), settings.values(rest))
+    else:
+        config = settings.parse(rest, options=("out", "resume"))
+        run = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{config.task}-seed{config.seed}"))
+    from pegasus_jax.build import build
+
+    build(config)  # so that impossible settings end here, before anything is written
+    if "resume" not in options:
+        record.create(run)
+    from pegasus_jax.train import train as run_trials
+
+    run_trials(config, run, resume="resume" in options, command=command)
+    print(f"done: {run} (pegasus-plot {run}, pegasus-eval {run})")
+
+
+def _evaluate(words: Sequence[str]) -> None:
+    run, rest = _run_and(words, {"episodes": "20", "seed": "0", "json": "false"})
+    episodes, seed = (_whole(name, rest[name]) for name in ("episodes", "seed"))
+    if rest["json"] not in ("true", "false"):
+        raise SettingError(f"json={rest['json']} is neither true nor false")
+    from pegasus_jax.train import evaluate_run
+
+    result = evaluate_run(run, episodes, seed)
+    if rest["json"] == "true":
+        print(json.dumps(result))
+    else:
+        print("\n".join(f"{name:>13}  {value}" for name, value in result.items()))
+
+
+def _plot(words: Sequence[str]) -> None:
+    run, _ = _run_and(words, {})
+    from pegasus_jax import settings, tasks
+    from pegasus_jax.report.plot import run_pictures
+
+    config = settings.load(run / "config.yaml")
+    for path in run_pictures(run, tasks.make(config.task)):
+        print(path)
+
+
+def _run_and(words: Sequence[str], defaults: dict[str, str]) -> tuple[Path, dict[str, str]]:
+    """The run's folder and the options of a command that reads a run."""
+    from pegasus_jax import record, settings
+    from pegasus_jax.config import nearest
+
+    named = [word for word in words if "=" not in word]
+    if len(named) != 1:
+        raise SettingError(f"name one run, not {len(named)}; for example runs/cartpole-seed0")
+    _, rest = settings.split([word for word in words if "=" in word])
+    for key in rest:
+        if key not in defaults:
+            raise SettingError(
+                f"{key} is not an option here; {nearest(key, defaults) if defaults else 'there are none'}"
+            )
+    return record.existing(Path(named[0])), defaults | rest
+
+
+def _whole(name: str, text: str) -> int:
+    if not text.isdecimal() or (name == "episodes" and int(text) < 1):
+        raise SettingError(f"{name}={text} is not a whole number; for example {name}=20")
+    return int(text)
+
+
+def _help(text: str) -> str:
+    if "{settings}" not in text:
+        return text
+    from pegasus_jax import settings
+    from pegasus_jax.config import ALGORITHMS, MODELS, POLICIES
+    from pegasus_jax.tasks import TASKS
+
+    named = dict(tasks=TASKS, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
+    lists = {name: ", ".join(values) for name, values in named.items()}
+    return text.format(settings="\n".join(settings.help_lines(Config())), **lists)
+
+
+def _main(command: Callable[[Sequence[str]], None], text: str) -> None:
+    """Run a command: 0 done, 1 stopped by its user, 2 a setting or a run's folder that cannot be, in one line."""
+    words = sys.argv[1:]
+    if not words or {"-h", "--help", "help"} & {*words}:
+        print(_help(text), end="")
+        sys.exit(0 if words else 2)
+    _remember_compilations()
+    from pegasus_jax.record import RunError
+
+    try:
+        command(words)
+    except (SettingError, RunError) as error:
+        print(f"pegasus: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("stopped; every finished episode is kept, resume=RUN goes on", file=sys.stderr)
+        sys.exit(1)
+
+
+def _remember_compilations() -> None:
+    """Keep compiled programs in the user's cache folder, unless JAX was told where already."""
+    import jax
+
+    if jax.config.read("jax_compilation_cache_dir") is None:
+        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pegasus_jax"
+        jax.config.update("jax_compilation_cache_dir", str(cache))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
