@@ -168,7 +168,7 @@ def _remember_compilations() -> None:
     """Keep compiled programs in the user's cache folder, unless JAX was told where already."""
     import jax
 
-    if jax.config.read("jax_compilation_cache_dir") is None:
+    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pegasus_jax"
         jax.config.update("jax_compilation_cache_dir", str(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
