@@ -234,6 +234,12 @@ def test_sincos_orders_features_as_encode_does():
     np.testing.assert_allclose(image.mean, angles.encode(jnp.array(MEAN), (2, 0)), atol=1e-15)
 
 
+def test_sincos_without_angles_is_the_identity():
+    image = gaussian.sincos(jnp.array(MEAN), jnp.array(COV), ())
+    for leaf, expected in zip(image, (MEAN, COV, np.eye(D)), strict=True):
+        np.testing.assert_allclose(leaf, expected)
+
+
 # Gaussian processes
 
 

@@ -6,9 +6,8 @@ for a singular covariance too. The input-output covariance itself is cov @ slope
 PILCO approximates Cov(x, f(g(x))) by Cov(x, g) Cov(g)^-1 Cov(g, f), slopes just multiply, without an inverse. One step
 of PILCO reads
 
-    control = chain(rbf_policy, squash)                            # features -> u
-    step = residual(chain(sincos, joint(control), dynamics))       # x -> features -> (features, u) -> change of x ->
-    next x
+    control = chain(rbf_policy, squash)                         # features -> u
+    step = residual(chain(sincos, joint(control), dynamics))    # x -> features -> (features, u) -> change -> next x
 
 where each name stands for a function of (mean, cov) with its other arguments bound. Sources: Deisenroth 2010 (thesis),
 ch. 3 and app. A; Deisenroth & Rasmussen 2011. Covariances are computed as scale * expm1(log ratio), not as E[fg] - E[f]
@@ -112,10 +111,9 @@ def _wave_cov(even: Array, odd: Array, cov: Array) -> Array:
 
 
 def sincos(mean: Array, cov: Array, angles: tuple[int, ...]) -> Image:
-    """Moments of the features [F] of x [D], ordered as in `angles.encode`: other dimensions, then all sines, then all
-    cosines.
+    """Moments of the features [F] of x [D] in the order of `angles.encode`: other dimensions, sines, cosines.
 
-    `angles` are the indices of the angle dimensions [rad]; F = D + len(angles). Exact (PILCO's gTrig).
+    `angles` are the indices of the angle dimensions [rad], maybe none; F = D + len(angles). Exact (PILCO's gTrig).
     """
     size = mean.shape[0]
     plain = np.array([i for i in range(size) if i not in angles], int)
