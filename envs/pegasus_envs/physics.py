@@ -23,6 +23,8 @@ import numpy as np
 from jax import Array
 from mujoco import mjx
 
+from pegasus_envs.fluid import passive_force
+
 ASSETS = Path(__file__).parent / "assets"
 
 # The classical Runge-Kutta method of order four: where to evaluate a stage, and the weight of the slope found there.
@@ -125,11 +127,11 @@ def acceleration(physics: Physics, qpos: Array, qvel: Array, control: Array) -> 
     """Generalised acceleration [nv] under actuator commands [nu]."""
     model = physics.device
     data = physics.blank.replace(qpos=qpos, qvel=qvel, ctrl=control)
-    for compute in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.transmission, mjx.com_vel, mjx.passive, mjx.rne):
+    for compute in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.transmission, mjx.com_vel, mjx.rne):
         data = compute(model, data)
     moment = data._impl.actuator_moment
     data = mjx.fwd_actuation(model, data.tree_replace({"_impl.actuator_velocity": moment @ qvel}))
-    force = data.qfrc_passive - data.qfrc_bias + data.qfrc_actuator
+    force = passive_force(physics, data) - data.qfrc_bias + data.qfrc_actuator
     return jax.scipy.linalg.solve(mjx.full_m(model, data), force, assume_a="pos")
 
 
