@@ -1,0 +1,19 @@
+"""What every test shares: key reuse is an error, property tests are repeatable, and float64 is one fixture away."""
+
+import jax
+import pytest
+from hypothesis import settings
+
+# A random key used twice raises, in jit, scan and vmap too: PEGASUS rests on knowing which draw is which.
+jax.config.update("jax_debug_key_reuse", True)
+
+# Derandomised: a failure in CI is the same failure here. No deadline: the first example compiles.
+settings.register_profile("repository", deadline=None, derandomize=True, max_examples=25)
+settings.load_profile("repository")
+
+
+@pytest.fixture
+def x64():
+    """Float64 inside one test, for closed forms and finite differences."""
+    with jax.enable_x64(True):
+        yield

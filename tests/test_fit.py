@@ -1,0 +1,137 @@
+"""Model fitting: it minimises, it reads only rows in use, and a bad gradient never poisons it."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from pegasus_jax.fit import fit, guarded
+from pegasus_jax.types import Dataset, Learner
+from probes import same
+
+N, SIZE = 30, 12
+NOISE = np.random.default_rng(0)
+X = NOISE.normal(size=(SIZE, 2))
+SLOPE = np.array([[1.0, -2.0], [0.5, 3.0]])
+Y = X @ SLOPE.T + 0.3 * NOISE.normal(size=(SIZE, 2))
+
+
+def data(junk):
+    """SIZE rows of a linear relation in a data set of capacity N, whose other rows hold `junk`."""
+    x, y = (np.vstack([rows, np.full((N - SIZE, 2), junk)]) for rows in (X, Y))
+    return Dataset(jnp.asarray(x, jnp.float32), jnp.zeros((N, 1)), jnp.asarray(y, jnp.float32), jnp.int32(SIZE))
+
+
+def squares(params, key, batch, context):
+    del key, context
+    return jnp.mean(jnp.sum((batch.y - batch.x @ params.T) ** 2, -1))
+
+
+def make(loss=squares, optimizer=None, steps=50, batch=8, prepare=lambda data: None):
+    optimizer = optimizer or guarded(optax.adam(optax.cosine_decay_schedule(0.1, steps)))
+    fitted = jax.jit(partial(fit, prepare=prepare, loss=loss, optimizer=optimizer, steps=steps, batch=batch))
+    return fitted, Learner(jnp.zeros((2, 2)), optimizer.init(jnp.zeros((2, 2))))
+
+
+@pytest.mark.parametrize("junk", [0.0, np.nan])
+def test_it_finds_the_least_squares_of_the_rows_in_use(junk):
+    """One row beyond `size` in one batch, and the result is not a number."""
+    fitted, learner = make(steps=1500, batch=64)
+    learner, info = fitted(jax.random.key(0), learner, data(junk))
+    expected = np.linalg.lstsq(X, Y, rcond=None)[0].T
+    np.testing.assert_allclose(learner.params, expected, atol=0.03)
+    assert info.skipped == 0
+    assert info.loss < info.first
+
+
+def test_the_losses_reported_are_those_of_the_first_and_last_tenth():
+    """Each step's loss is its number here: gradient 1, step size 1, loss = -params."""
+    fitted, learner = make(lambda p, key, batch, context: jnp.sum(p), guarded(optax.sgd(0.25)), steps=40)
+    _, info = fitted(jax.random.key(0), learner, data(0))
+    np.testing.assert_allclose([info.first, info.loss], [-1.5, -37.5])
+    fitted, learner = make(lambda p, key, batch, context: jnp.sum(p), guarded(optax.sgd(0.25)), steps=3)
+    _, info = fitted(jax.random.key(0), learner, data(0))
+    np.testing.assert_allclose([info.first, info.loss], [0, -2])
+
+
+def test_prepare_sees_the_whole_data_set_and_the_loss_its_answer():
+    fitted, learner = make(
+        lambda p, key, batch, context: jnp.sum((p - context) ** 2),
+        guarded(optax.sgd(0.5)),
+        steps=1,
+        prepare=lambda data: data.size.astype(jnp.float32),
+    )
+    learner, _ = fitted(jax.random.key(0), learner, data(0))
+    np.testing.assert_allclose(learner.params, SIZE * np.ones((2, 2)))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_bad_gradient_skips_its_update_and_nothing_else(value):
+    """Bad at random: what remains are so many unit gradients, of which descent and Adam must have seen each."""
+    bad = []
+
+    def loss(params, key, batch, context):
+        spoiled = jax.random.bernoulli(key, 0.3)
+        jax.debug.callback(lambda b: bad.append(bool(b)), spoiled)
+        return jnp.sum(params * jnp.where(spoiled, value, 1.0))
+
+    optimizer = guarded(optax.chain(optax.scale_by_adam(), optax.scale(-1.0)))
+    fitted, learner = make(loss, optimizer, steps=40)
+    learner, info = fitted(jax.random.key(0), learner, data(0))
+    jax.effects_barrier()
+    assert len(bad) == 40
+    assert 0 < sum(bad) < 40
+    assert info.skipped == sum(bad)
+    good = 40 - sum(bad)
+    np.testing.assert_allclose(learner.params, -good * np.ones((2, 2)), rtol=1e-4)  # Adam's step on a constant gradient
+    assert learner.optimizer.inner_state[0].count == good
+    np.testing.assert_allclose(learner.optimizer.inner_state[0].mu, 1 - 0.9**good, rtol=1e-5)
+    _, again = fitted(jax.random.key(1), learner, data(0))
+    jax.effects_barrier()
+    assert again.skipped == sum(bad[40:])  # each call counts its own
+
+
+def test_a_fit_that_sees_nothing_but_bad_gradients_changes_nothing():
+    fitted, learner = make(lambda p, key, batch, context: jnp.sum(p) * jnp.nan)
+    after, info = fitted(jax.random.key(0), learner, data(0))
+    assert same(after.params, learner.params)
+    assert same(after.optimizer.inner_state, learner.optimizer.inner_state)
+    assert info.skipped == 50
+
+
+def test_steps_differ_in_rows_and_noise_and_keys_decide_them():
+    """No two steps see the same key, and none sees the key of the rows."""
+    keys, rows = [], []
+
+    def loss(params, key, batch, context):
+        jax.debug.callback(lambda k: keys.append(k.tobytes()), jax.random.key_data(key))
+        jax.debug.callback(lambda x: rows.append(x.tobytes()), batch.x)
+        return jnp.sum(params * jax.random.normal(key))
+
+    fitted, learner = make(loss)
+    first, _ = fitted(jax.random.key(0), learner, data(0))
+    jax.effects_barrier()
+    assert len(set(keys)) == len(set(rows)) == 50
+    again, _ = fitted(jax.random.key(0), learner, data(0))
+    other, _ = fitted(jax.random.key(1), learner, data(0))
+    assert same(first, again)
+    assert not same(first.params, other.params)
+
+
+def test_more_data_does_not_trace_again():
+    traces = 0
+
+    def loss(params, key, batch, context):
+        nonlocal traces
+        traces += 1
+        return squares(params, key, batch, context)
+
+    fitted, learner = make(loss)
+    for trial in (4, 8, 12):
+        learner, _ = fitted(jax.random.key(trial), learner, data(0)._replace(size=jnp.int32(trial)))
+        if trial == 4:
+            once = traces
+    assert traces == once

@@ -1,0 +1,54 @@
+"""The network: a ReLU perceptron, one mask for every layer's input."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_jax.network import INITIALISERS, MLP
+
+
+def forward(params, x, masks):
+    """The same network in NumPy."""
+    layers = [params["params"][f"layer_{i}"] for i in range(len(params["params"]))]
+    for i, layer in enumerate(layers):
+        x = (x if masks[i] is None else x * masks[i]) @ np.asarray(layer["kernel"]) + np.asarray(layer["bias"])
+        x = np.maximum(x, 0) if i < len(layers) - 1 else x
+    return x
+
+
+@pytest.mark.parametrize("hidden", [(), (5,), (6, 5)])
+@pytest.mark.parametrize("masked", [False, True])
+def test_it_is_the_network_of_the_docstring(hidden, masked):
+    noise = np.random.default_rng(0)
+    network = MLP(hidden, 2)
+    params = network.init(jax.random.key(0), jnp.zeros(3), [None] * (len(hidden) + 1))
+    masks = [noise.uniform(size=w).astype(np.float32) if masked else None for w in (3, *hidden)]
+    x = noise.normal(size=(4, 3)).astype(np.float32)
+    np.testing.assert_allclose(network.apply(params, x, masks), forward(params, x, masks), atol=1e-5)
+
+
+def test_every_row_may_have_its_own_mask():
+    network = MLP((5,), 2)
+    params = network.init(jax.random.key(0), jnp.zeros(3), [None, None])
+    x = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
+    mask = np.random.default_rng(1).integers(0, 2, size=(4, 5)).astype(np.float32)
+    rows = [network.apply(params, x[i], [None, mask[i]]) for i in range(4)]
+    np.testing.assert_allclose(network.apply(params, x, [None, mask]), rows, atol=1e-6)
+
+
+@pytest.mark.parametrize("name", INITIALISERS)
+def test_initial_weights(name):
+    """Glorot: variance 2 / (in + out). Orthogonal: the rows or columns are orthonormal. Biases: within .01."""
+    params = jax.jit(lambda key: MLP((60,), 40, name).init(key, jnp.zeros(50), [None, None]))(jax.random.key(0))[
+        "params"
+    ]
+    kernel = np.asarray(params["layer_1"]["kernel"])
+    assert kernel.shape == (60, 40)
+    if name == "orthogonal":
+        np.testing.assert_allclose(kernel.T @ kernel, np.eye(40), atol=1e-5)
+    else:
+        np.testing.assert_allclose(kernel.var(), 2 / 100, rtol=0.1)
+    biases = np.concatenate([params[f"layer_{i}"]["bias"] for i in range(2)])
+    assert np.all(np.abs(biases) <= 0.01)
+    assert len(np.unique(biases)) == 100

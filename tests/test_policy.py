@@ -1,0 +1,111 @@
+"""Controllers: within the limits whatever they see, one mask along a rollout, and a mean policy without any."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from pegasus_jax import dropout
+from pegasus_jax.policy.squash import SQUASHES, sine, to_limits
+from probes import LIMITS, controller
+
+every_squash = pytest.mark.parametrize("squash", SQUASHES)
+single = st.floats(-1e6, 1e6, width=32)
+
+
+@pytest.fixture(scope="module")
+def outputs():
+    """Every squash's controls [U] of (seed, x), by a network whose weights are large enough to saturate."""
+    acts = {}
+    for squash in SQUASHES:
+        policy = controller(squash=squash, output_scale=30.0)
+
+        def act(seed, x, policy=policy):
+            keys = jax.random.split(jax.random.key(seed))
+            return policy.apply(policy.init(keys[0]), policy.sample(keys[1]), x)
+
+        acts[squash] = jax.jit(act)
+    return acts
+
+
+@every_squash
+@given(seed=st.integers(0, 2**16), x=arrays(np.float32, 3, elements=single))
+def test_controls_are_within_limits_for_any_state(squash, outputs, seed, x):
+    u = np.asarray(outputs[squash](seed, x))
+    assert np.all(u >= LIMITS[0])
+    assert np.all(u <= LIMITS[1])
+
+
+@every_squash
+@given(arrays(np.float32, 2, elements=st.floats(-100, 100, width=32)), st.integers(0, 2**16))
+def test_saturation_never_leaves_the_limits_by_a_single_bit(squash, ends, seed):
+    """A Gymnasium box refuses a control that is one rounding outside, and so may a motor driver."""
+    low, high = np.sort(ends)
+    v = np.random.default_rng(seed).normal(size=64).astype(np.float32) * 10
+    u = np.asarray(to_limits(SQUASHES[squash], jnp.float32(low), jnp.float32(high))(jnp.asarray(v)))
+    assert np.all(u >= low)
+    assert np.all(u <= high)
+
+
+@every_squash
+def test_the_middle_and_both_ends_are_reached(squash):
+    to = to_limits(SQUASHES[squash], *(jnp.asarray(limit, jnp.float32) for limit in LIMITS))
+    end = np.pi / 2 if squash == "sine" else 20.0
+    np.testing.assert_allclose(to(jnp.zeros(2)), (LIMITS[0] + LIMITS[1]) / 2, atol=1e-6)
+    np.testing.assert_allclose(to(jnp.full(2, end)), LIMITS[1], atol=1e-6)
+    np.testing.assert_allclose(to(jnp.full(2, -end)), LIMITS[0], atol=1e-6)
+
+
+def test_the_sine_saturation_is_pilcos():
+    """Flat to third order at its ends: sin^3 and nothing else has sin 3v = 3 sin v - 4 sin^3 v."""
+    v = np.linspace(-2, 2, 41, dtype=np.float32)
+    np.testing.assert_allclose(sine(v), (12 * np.sin(v) - 4 * np.sin(v) ** 3) / 8, atol=1e-6)
+    assert abs(jax.grad(sine)(jnp.float32(np.pi / 2))) < 1e-6
+
+
+def test_the_mean_policy_is_the_network_with_every_unit_at_its_expected_size():
+    """Against NumPy, with the masks of binary dropout and with their mean."""
+    policy = controller(dropout.binary(0.3))
+    params = policy.init(jax.random.key(0))
+    noise = policy.sample(jax.random.key(1))
+    x = np.array([0.3, -0.7, 2.0], np.float32)
+    layers = [jax.tree.map(np.asarray, params["network"]["params"][f"layer_{i}"]) for i in range(2)]
+    features = np.array([x[0], x[1], np.sin(x[2]), np.cos(x[2])])
+    hidden = np.maximum(features @ layers[0]["kernel"] + layers[0]["bias"], 0)
+    middle, half = (LIMITS[1] + LIMITS[0]) / 2, (LIMITS[1] - LIMITS[0]) / 2
+    for draw, mask in ((None, 0.7), (noise, np.asarray(noise[0]) < 0.7)):
+        expected = middle + half * np.tanh((hidden * mask) @ layers[1]["kernel"] + layers[1]["bias"])
+        np.testing.assert_allclose(policy.apply(params, draw, x), expected, atol=1e-5)
+
+
+def test_a_policy_without_noise_is_its_own_mean():
+    policy = controller(dropout.none())
+    params, x = policy.init(jax.random.key(0)), jnp.array([0.3, -0.7, 2.0])
+    assert np.array_equal(policy.apply(params, policy.sample(jax.random.key(1)), x), policy.apply(params, None, x))
+
+
+def test_a_mask_is_a_draw_and_the_control_a_function_of_it():
+    """The same draw gives the same control; other draws drop other units, each at the given rate."""
+    policy = controller(dropout.binary(0.3), hidden=(50, 50))
+    draws = jax.vmap(policy.sample)(jax.random.split(jax.random.key(0), 100))
+    assert [d.shape for d in draws] == [(100, 50)] * 2
+    for layer in draws:
+        np.testing.assert_allclose(np.mean(np.asarray(layer) < 0.7), 0.7, atol=0.03)
+    assert not np.any(np.asarray(draws[0]) == np.asarray(draws[1]))  # layers are drawn apart
+    params, x = policy.init(jax.random.key(1)), jnp.array([0.3, -0.7, 2.0])
+    u = jax.vmap(policy.apply, (None, 0, None))(params, draws, x)
+    assert len(np.unique(u, axis=0)) == 100
+    np.testing.assert_allclose(policy.apply(params, [d[3] for d in draws], x), u[3], rtol=1e-5)
+
+
+def test_scales_of_input_and_output():
+    params = [controller(output_scale=s).init(jax.random.key(0))["network"]["params"] for s in (1.0, 0.1)]
+    np.testing.assert_allclose(params[1]["layer_1"]["kernel"], 0.1 * params[0]["layer_1"]["kernel"], rtol=1e-5)
+    assert np.array_equal(params[1]["layer_0"]["kernel"], params[0]["layer_0"]["kernel"])
+    plain, scaled = controller(dropout.none()), controller(dropout.none(), input_scale=jnp.array([2.0, 1, 1, 1]))
+    both = plain.init(jax.random.key(0))
+    one, two = plain.apply(both, None, jnp.array([0.6, 0.2, 1.0])), scaled.apply(both, None, jnp.array([0.3, 0.2, 1.0]))
+    np.testing.assert_allclose(one, two, rtol=1e-5)

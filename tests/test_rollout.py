@@ -1,0 +1,190 @@
+"""Rollouts: a scan and a vmap that equal the loop of Alg. 3 written out, particle by particle."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pegasus_jax import moments
+from pegasus_jax.rollout import NoiseUse, rollout
+from pegasus_jax.scenarios import draw
+from pegasus_jax.types import Dynamics, Period, Policy, Prediction, Scenarios
+from probes import rig
+
+K, H, D = 7, 4, 3
+MATCHES = {"match": moments.match, "keep": moments.keep}
+NOISE = NoiseUse(policy=0.7, state=0.4, cost=0.5)
+every_match = pytest.mark.parametrize("match", MATCHES)
+seeds = st.integers(0, 2**16)
+
+
+@pytest.fixture(scope="module")
+def jitted():
+    """Seed -> scenarios, and (scenarios, match) -> rollout, compiled once."""
+    r = rig(K, H)
+    scenarios = jax.jit(lambda seed: draw(jax.random.key(seed), 0, r.belief, blocks=r.blocks, period=Period()))
+    roll = {
+        name: jax.jit(partial(rollout, dynamics=r.dynamics, policy=r.policy, match=match, noise=NOISE))
+        for name, match in MATCHES.items()
+    }
+    return scenarios, lambda given, name: roll[name](r.params, r.belief, given)
+
+
+def match_numpy(x, z):
+    """Mean + L z with the library's Cholesky factor, in float64."""
+    return x.mean(0) + z @ np.linalg.cholesky(np.cov(x.astype(np.float64).T)).T
+
+
+@every_match
+def test_the_scan_equals_a_python_loop(match, jitted):
+    r, given = rig(K, H), jitted[0](3)
+    act, predict = jax.jit(r.policy.apply), jax.jit(r.dynamics.apply)
+    draws = [jax.tree.map(lambda leaf, k=k: leaf[k], (given.policy, given.dynamics)) for k in range(K)]
+    x, blur = np.asarray(given.start), np.zeros((K, D))
+    xs, us, stds, seen = [x], [], [], []
+    for t in range(H):
+        u, after, std = [], [], []
+        for k, (mask, weights) in enumerate(draws):
+            u.append(np.asarray(act(r.params, mask, x[k] + NOISE.policy * blur[k])))
+            change = predict(r.belief, weights, x[k], u[k])
+            after.append(x[k] + change.mean + NOISE.state * change.std * given.sensor[t, k])
+            std.append(change.std)
+        x, std = np.array(after), np.array(std)
+        blur = std * np.asarray(given.sensor[t])
+        if match == "match":
+            x = match_numpy(x, np.asarray(given.match[t]))
+        xs.append(x)
+        us.append(u)
+        stds.append(std)
+        seen.append(x + NOISE.cost * blur)
+    imagined = jitted[1](given, match)
+    for ours, loops in zip(imagined, (xs, us, stds, seen), strict=True):
+        assert ours.shape == np.shape(loops)
+        np.testing.assert_allclose(ours, np.array(loops), rtol=2e-4, atol=2e-4)
+
+
+@given(seed=seeds)
+def test_the_same_scenarios_give_the_same_bits(jitted, seed):
+    scenarios, roll = jitted
+    first, second = (roll(scenarios(seed), "match") for _ in range(2))
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+
+
+def test_k_particles_are_k_rollouts_of_one(jitted):
+    r, given = rig(K, H), jitted[0](5)
+    alone = jax.jit(partial(rollout, dynamics=r.dynamics, policy=r.policy, match=moments.keep, noise=NOISE))
+    together = jitted[1](given, "keep")
+    for k in range(K):
+        one = slice(k, k + 1)
+        only = Scenarios(
+            given.start[one],
+            *jax.tree.map(lambda leaf, one=one: leaf[one], (given.dynamics, given.policy)),
+            given.sensor[:, one],
+            given.match[:, one],
+        )
+        for a, b in zip(alone(r.params, r.belief, only), together, strict=True):
+            np.testing.assert_allclose(a[:, 0], b[:, k], rtol=1e-5, atol=1e-5)
+
+
+@every_match
+@given(seed=seeds)
+def test_permuting_the_scenarios_permutes_the_particles(match, jitted, seed):
+    scenarios, roll = jitted
+    given = scenarios(seed)
+    order = np.random.default_rng(seed).permutation(K)
+    mixed = Scenarios(
+        given.start[order],
+        *jax.tree.map(lambda leaf: leaf[order], (given.dynamics, given.policy)),
+        given.sensor[:, order],
+        given.match[:, order],
+    )
+    for a, b in zip(roll(mixed, match), roll(given, match), strict=True):
+        np.testing.assert_allclose(a, b[:, order], rtol=1e-3, atol=1e-3)
+
+
+def test_matched_particles_lose_their_own_path_but_not_their_moments(jitted):
+    """With matching, the match noise of step t decides the particles at t; without, it is not read at all."""
+    scenarios, roll = jitted
+    given = scenarios(8)
+    other = given._replace(match=given.match.at[1].multiply(-1))
+    kept, kept_other = roll(given, "keep"), roll(other, "keep")
+    assert all(np.array_equal(a, b) for a, b in zip(kept, kept_other, strict=True))
+    matched, matched_other = roll(given, "match"), roll(other, "match")
+    assert np.array_equal(matched.x[:2], matched_other.x[:2])
+    assert not np.allclose(matched.x[2], matched_other.x[2], atol=1e-2)
+
+
+# Pieces whose draws can be read off the trajectories
+
+CONSTANT = Scenarios(
+    start=jnp.arange(6.0).reshape(3, 2),
+    dynamics=jnp.array([[1.0, 0.0], [0.0, 10.0], [-5.0, 2.0]]),
+    policy=jnp.array([3.0, -1.0, 0.5]),
+    sensor=jnp.asarray(np.random.default_rng(0).normal(size=(5, 3, 2)), jnp.float32),
+    match=jnp.zeros((5, 3, 2)),
+)
+
+
+def model(apply):
+    nothing = lambda *a: None  # noqa: E731
+    return Dynamics(nothing, nothing, nothing, nothing, nothing, apply)
+
+
+def controller(apply):
+    return Policy(lambda key: None, lambda key: None, apply)
+
+
+def test_a_particle_holds_its_draws_for_the_whole_trajectory():
+    dynamics = model(lambda belief, draw, x, u: Prediction(draw, jnp.zeros(2)))
+    policy = controller(lambda params, noise, x: noise[None])
+    imagined = rollout(None, None, CONSTANT, dynamics=dynamics, policy=policy, match=moments.keep)
+    steps = np.diff(imagined.x, axis=0)
+    np.testing.assert_allclose(steps, np.broadcast_to(CONSTANT.dynamics, (5, 3, 2)), atol=1e-5)
+    assert np.array_equal(imagined.u[..., 0], np.broadcast_to(CONSTANT.policy, (5, 3)))
+    assert np.array_equal(imagined.x[0], CONSTANT.start)
+
+
+@given(*[st.floats(0, 2, width=32)] * 3)
+def test_noise_factors_do_what_they_say(policy_factor, state_factor, cost_factor):
+    """The controller repeats what it sees, the model stands still: each factor can be read off."""
+    std = jnp.array([0.5, 2.0])
+    imagined = STILL(NoiseUse(policy_factor, state_factor, cost_factor), std)
+    blur = np.asarray(std * CONSTANT.sensor)
+    np.testing.assert_allclose(imagined.u[0], imagined.x[0], atol=1e-6)  # the first state is seen as it is
+    np.testing.assert_allclose(imagined.u[1:], imagined.x[1:-1] + policy_factor * blur[:-1], atol=1e-5)
+    np.testing.assert_allclose(np.diff(imagined.x, axis=0), state_factor * blur, atol=1e-5)
+    np.testing.assert_allclose(imagined.seen, imagined.x[1:] + cost_factor * blur, atol=1e-5)
+    assert np.array_equal(imagined.std, np.broadcast_to(std, (5, 3, 2)))
+
+
+@jax.jit
+def STILL(noise, std):
+    dynamics = model(lambda belief, draw, x, u: Prediction(jnp.zeros(2), std))
+    policy = controller(lambda params, noise, x: x)
+    return rollout(None, None, CONSTANT, dynamics=dynamics, policy=policy, match=moments.keep, noise=noise)
+
+
+def test_the_default_is_the_authors_noise_on_the_policy_input_alone():
+    assert NoiseUse() == (1.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize("factor", range(3))
+def test_no_gradient_flows_through_the_predicted_noise(factor):
+    """A policy that could lower its cost by making the model sure of itself must not be told so."""
+    noise = NoiseUse(*(float(i == factor) for i in range(3)))
+    policy = controller(lambda params, draw, x: jnp.stack([params, x[0]]))  # what the std depends on; what is seen
+
+    def loss(params, through_mean):
+        dynamics = model(lambda belief, draw, x, u: Prediction(through_mean * u[:1] * jnp.ones(2), (u[0] * x) ** 2))
+        imagined = rollout(params, None, CONSTANT, dynamics=dynamics, policy=policy, match=moments.keep, noise=noise)
+        return jnp.sum(imagined.seen**2) + jnp.sum(imagined.u[..., 1] ** 2)
+
+    value, gradient = jax.jit(loss), jax.jit(jax.grad(loss))
+    params = jnp.float32(0.1)
+    assert value(params, 0.0) != value(2 * params, 0.0)  # the noise does depend on the parameters
+    assert gradient(params, 0.0) == 0
+    assert gradient(params, 0.1) != 0

@@ -1,0 +1,298 @@
+"""Policy search: the objective against closed forms and finite differences, the optimiser against a loop."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize
+
+from pegasus_jax import cost, moments, scenarios
+from pegasus_jax.fit import guarded
+from pegasus_jax.rollout import NoiseUse
+from pegasus_jax.search import objective, optimise
+from pegasus_jax.types import Learner, Period, Scenarios
+from probes import (
+    PENDULUM,
+    SCALAR,
+    balanced_start,
+    cart,
+    expected_cost,
+    known,
+    linear_policy,
+    make_rig,
+    rig,
+    same,
+)
+
+# The objective on the rig
+
+
+@pytest.fixture(scope="module")
+def on_rig():
+    """(seed) -> scenarios, scenarios -> (objective, gradient), compiled once."""
+    r = rig()
+    draw = jax.jit(lambda seed: scenarios.draw(jax.random.key(seed), 0, r.belief, blocks=r.blocks, period=Period()))
+    value = partial(objective, dynamics=r.dynamics, policy=r.policy, match=moments.match, cost=r.cost)
+    gradient = jax.jit(jax.value_and_grad(value))
+    return draw, lambda given: gradient(r.params, r.belief, given)
+
+
+@given(seed=st.integers(0, 2**16))
+def test_the_same_scenarios_give_the_same_objective_to_the_bit(on_rig, seed):
+    draw, value = on_rig
+    first, again, other = value(draw(seed)), value(draw(seed)), value(draw(seed + 1))
+    assert same(first, again)
+    assert not same(first, other)
+    assert 0 < first[0] < 1
+
+
+@given(seed=st.integers(0, 2**16))
+def test_the_objective_does_not_depend_on_the_order_of_particles(on_rig, seed):
+    draw, value = on_rig
+    given = draw(seed)
+    order = np.random.default_rng(seed).permutation(rig().particles)
+    mixed = Scenarios(
+        given.start[order],
+        *jax.tree.map(lambda leaf: leaf[order], (given.dynamics, given.policy)),
+        given.sensor[:, order],
+        given.match[:, order],
+    )
+    np.testing.assert_allclose(value(mixed)[0], value(given)[0], rtol=1e-4)
+
+
+@pytest.mark.parametrize("match", [moments.match, moments.keep])
+def test_the_gradient_equals_finite_differences(match, x64):
+    """With the noise held the objective is an ordinary function. The model's noise is homoscedastic here, because no
+    gradient is meant to flow through a predicted one."""
+    r = make_rig(particles=7, horizon=4, heteroscedastic=False)
+    given = jax.jit(lambda k: scenarios.draw(k, 0, r.belief, blocks=r.blocks, period=Period()))(jax.random.key(0))
+    pieces = dict(dynamics=r.dynamics, policy=r.policy, match=match, cost=r.cost, noise=NoiseUse(1.0, 0.5, 0.5))
+    value = jax.jit(partial(objective, **pieces))
+    gradient = jax.jit(jax.grad(partial(objective, **pieces)))(r.params, r.belief, given)
+    for seed in range(4):
+        noise = np.random.default_rng(seed)
+        direction = jax.tree.map(lambda leaf, noise=noise: jnp.asarray(noise.normal(size=leaf.shape)), r.params)
+        move = lambda step, d=direction: jax.tree.map(lambda p, v: p + step * v, r.params, d)  # noqa: E731
+        slope = (value(move(1e-6), r.belief, given) - value(move(-1e-6), r.belief, given)) / 2e-6
+        np.testing.assert_allclose(optax.tree.vdot(gradient, direction), slope, rtol=1e-5, atol=1e-9)
+        assert abs(slope) > 1e-4
+
+
+# The linear-Gaussian plant, whose expected cost and best gain are known
+
+
+def linear_objective(plant, particles):
+    """gain -> objective under exactly balanced noise, and the pieces `optimise` wants."""
+    dynamics, policy = known(plant), linear_policy(*plant.b.shape)
+    blocks = scenarios.blocks(
+        dynamics=dynamics,
+        policy=policy,
+        start=lambda key: jax.random.normal(key, plant.mean.shape),
+        particles=particles,
+        horizon=plant.horizon,
+        balanced=True,
+    )._replace(start=balanced_start(plant, particles))
+    value = partial(
+        objective,
+        dynamics=dynamics,
+        policy=policy,
+        match=moments.match,
+        cost=cost.of_particles(lambda x: x @ jnp.asarray(plant.q, x.dtype) @ x),
+    )
+    return value, blocks
+
+
+def best_gain(plant, particles):
+    """The gain with the least expected cost, from the covariance recursion and nothing of the package."""
+    shape = plant.b.T.shape
+    found = minimize(
+        lambda g: expected_cost(plant, g.reshape(shape), particles), np.full(shape, -1.0).ravel(), tol=1e-12
+    )
+    return found.x.reshape(shape)
+
+
+@pytest.mark.parametrize("plant", [SCALAR, PENDULUM])
+def test_matched_balanced_particles_give_the_exact_expected_cost(plant, x64):
+    """Moment matching makes the particle cloud the Gaussian: a quadratic cost is then exact, for any draw."""
+    particles = 5
+    value, blocks = linear_objective(plant, particles)
+    of_gain = jax.jit(lambda gain, given: value(gain, None, given))
+    draw = jax.jit(lambda seed: scenarios.draw(jax.random.key(seed), 0, None, blocks=blocks, period=Period()))
+    for seed in range(3):
+        gain = np.random.default_rng(seed).normal(size=plant.b.T.shape)
+        np.testing.assert_allclose(of_gain(gain, draw(seed)), expected_cost(plant, gain, particles), rtol=1e-8)
+
+
+@pytest.mark.parametrize("plant", [SCALAR, PENDULUM])
+def test_the_search_finds_the_best_gain(plant):
+    particles = 12
+    value, blocks = linear_objective(plant, particles)
+    pieces = dict(blocks=blocks, period=Period())
+    # The unstable start gives large gradients, which Adam must forget: hence b2.
+    adam = optax.adam(optax.cosine_decay_schedule(0.1, 800), b2=0.95)
+    optimizer = guarded(optax.chain(optax.clip_by_global_norm(1.0), adam))
+    gain = jnp.zeros(plant.b.T.shape)
+    search = jax.jit(
+        partial(
+            optimise,
+            draw=partial(scenarios.draw, **pieces),
+            redraw=partial(scenarios.redraw, **pieces),
+            objective=value,
+            optimizer=optimizer,
+            steps=800,
+        )
+    )
+    learner, info = search(jax.random.key(0), Learner(gain, optimizer.init(gain)), None)
+    best = best_gain(plant, particles)
+    if plant is SCALAR:
+        np.testing.assert_allclose(best, [[-2.4]], atol=1e-4)  # -a / b brings any state to 0 in one step
+    np.testing.assert_allclose(learner.params, best, atol=2e-3)
+    np.testing.assert_allclose(info.objective[-1], expected_cost(plant, best, particles), rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(info.objective[0], expected_cost(plant, np.zeros_like(best), particles), rtol=1e-3)
+    assert info.skipped == 0
+
+
+def test_a_known_control_is_found_through_limits_and_costs():
+    """One step of the cart probe, from rest at 1 m: the best force within the limits is a number."""
+    task = cart(horizon=1)
+    start = jnp.array([1.0, 0.0])
+    cost_of = lambda u: task.cost(task.plant.step(start, u))  # noqa: E731
+    grid = np.linspace(-2, 2, 4001, dtype=np.float32)[:, None]
+    best = grid[np.argmin(jax.vmap(cost_of)(grid))]
+    optimizer = guarded(optax.adam(0.05))
+    learner, _ = optimise(
+        jax.random.key(0),
+        Learner(jnp.zeros(1), optimizer.init(jnp.zeros(1))),
+        None,
+        draw=lambda key, step, belief: None,
+        redraw=lambda key, step, held, belief: held,
+        objective=lambda params, belief, given: cost_of(2 * jnp.tanh(params)),
+        optimizer=optimizer,
+        steps=200,
+    )
+    np.testing.assert_allclose(2 * jnp.tanh(learner.params), best, atol=5e-3)
+
+
+# The optimiser, on an objective simple enough to follow by hand: |params - scenarios|^2
+
+
+def follow(key, step, belief):
+    """A target of its own for every iteration."""
+    return jax.random.normal(jax.random.fold_in(key, step), (3,))
+
+
+def distance(params, belief, target):
+    return jnp.sum((params - target) ** 2) * belief
+
+
+def pursue(optimizer, steps, *, bad=(), value=jnp.nan, scale=1.0):
+    """A jitted search whose target is `value` at the iterations `bad`."""
+
+    def draw(key, step, belief):
+        spoiled = jnp.isin(step, jnp.asarray(bad, jnp.int32)) if bad else False
+        return jnp.where(spoiled, value, scale * follow(key, step, belief))
+
+    return jax.jit(
+        partial(
+            optimise,
+            draw=draw,
+            redraw=lambda key, step, held, belief: draw(key, step, belief),
+            objective=distance,
+            optimizer=optimizer,
+            steps=steps,
+        )
+    )
+
+
+def begin(optimizer):
+    return Learner(jnp.ones(3), optimizer.init(jnp.ones(3)))
+
+
+def loop(optimizer, iterations):
+    """The same search as a Python loop over the given iterations."""
+    learner, key = begin(optimizer), jax.random.key(7)
+    for i in iterations:
+        gradient = jax.grad(distance)(learner.params, 1.0, follow(jax.random.clone(key), i, None))
+        updates, state = optimizer.update(gradient, learner.optimizer, learner.params)
+        learner = Learner(optax.apply_updates(learner.params, updates), state)
+    return learner
+
+
+def test_the_search_is_gradient_descent_on_the_scenarios_of_each_iteration():
+    optimizer = guarded(optax.adam(0.1))
+    learner, info = pursue(optimizer, 6)(jax.random.key(7), begin(optimizer), 1.0)
+    expected = loop(optimizer, range(6))
+    np.testing.assert_allclose(learner.params, expected.params, rtol=1e-5)
+    assert info.objective.shape == info.gradient_norm.shape == (6,)
+    first = distance(jnp.ones(3), 1.0, follow(jax.random.key(7), 0, None))
+    np.testing.assert_allclose(info.objective[0], first, rtol=1e-6)
+    np.testing.assert_allclose(info.gradient_norm[0], 2 * np.sqrt(first), rtol=1e-5)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_bad_gradient_skips_its_update_and_nothing_else(value):
+    """Parameters and optimiser state are those of a search that never had these iterations."""
+    optimizer = guarded(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.1)))
+    learner, info = pursue(optimizer, 8, bad=(2, 3, 6), value=value)(jax.random.key(7), begin(optimizer), 1.0)
+    expected = loop(optimizer, [0, 1, 4, 5, 7])
+    np.testing.assert_allclose(learner.params, expected.params, rtol=1e-5)
+    for ours, theirs in zip(
+        jax.tree.leaves(learner.optimizer.inner_state), jax.tree.leaves(expected.optimizer.inner_state), strict=True
+    ):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-5)
+    assert info.skipped == 3
+    assert np.array_equal(np.isfinite(info.gradient_norm), [1, 1, 0, 0, 1, 1, 0, 1])
+
+
+def test_a_search_that_sees_nothing_but_bad_gradients_changes_nothing():
+    optimizer = guarded(optax.adam(0.1))
+    learner, info = pursue(optimizer, 5, bad=tuple(range(5)))(jax.random.key(7), begin(optimizer), 1.0)
+    assert np.array_equal(learner.params, np.ones(3))
+    assert same(learner.optimizer.inner_state, begin(optimizer).optimizer.inner_state)
+    assert info.skipped == 5
+    _, info = pursue(optimizer, 5)(jax.random.key(7), learner, 1.0)
+    assert info.skipped == 0  # each call counts its own
+
+
+def test_clipping_limits_the_update_and_keeps_its_direction():
+    optimizer = guarded(optax.chain(optax.clip_by_global_norm(0.5), optax.sgd(1.0)))
+    for scale in (1e-2, 1e3):
+        learner, info = pursue(optimizer, 1, scale=0.0)(jax.random.key(7), begin(optimizer), scale)
+        gradient = 2 * scale * np.ones(3)
+        moved = np.ones(3) - np.asarray(learner.params)
+        np.testing.assert_allclose(moved, gradient * min(1, 0.5 / np.linalg.norm(gradient)), rtol=1e-4)
+        np.testing.assert_allclose(info.gradient_norm[0], np.linalg.norm(gradient), rtol=1e-5)  # before clipping
+
+
+def test_a_search_in_pieces_is_the_same_search_to_the_bit():
+    """What lets a progress display look in, and a killed run go on."""
+    r = rig()
+    pieces = dict(blocks=r.blocks, period=Period(start=1, dynamics=2, policy=0, sensor=3, match=5))
+    optimizer = guarded(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.01)))
+
+    def search(steps):
+        return jax.jit(
+            partial(
+                optimise,
+                draw=partial(scenarios.draw, **pieces),
+                redraw=partial(scenarios.redraw, **pieces),
+                objective=partial(objective, dynamics=r.dynamics, policy=r.policy, match=moments.match, cost=r.cost),
+                optimizer=optimizer,
+                steps=steps,
+            )
+        )
+
+    key = jax.random.key(3)
+    learner = Learner(r.params, optimizer.init(r.params))
+    whole, info = search(6)(key, learner, r.belief)
+    part, values = search(2), []
+    for first in (0, 2, 4):
+        learner, chunk = part(key, learner, r.belief, first=first)
+        values.append(chunk.objective)
+    assert same(whole, learner)
+    assert np.array_equal(info.objective, np.concatenate(values))

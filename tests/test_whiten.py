@@ -1,0 +1,99 @@
+"""Whitening: an exact affine change of coordinates, from the rows in use and no others."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pegasus_jax import whiten as module
+
+whitener = jax.jit(module.whitener, static_argnames="full")
+whiten, unwhiten = jax.jit(module.whiten), jax.jit(module.unwhiten)
+N, F = 40, 3
+seeds = st.integers(0, 2**16)
+both = pytest.mark.parametrize("full", [True, False])
+
+
+def correlated(seed, rows=N, scale=1.0):
+    noise = np.random.default_rng(seed)
+    root = noise.normal(size=(F, F)) + 2 * np.eye(F)
+    return (noise.normal(size=F) * 5 + scale * noise.normal(size=(rows, F)) @ root.T).astype(np.float32)
+
+
+@given(seeds, st.integers(F + 2, N), st.booleans())
+def test_unwhiten_undoes_whiten(seed, size, full):
+    rows = jnp.asarray(correlated(seed))
+    w = whitener(rows, jnp.int32(size), full=full)
+    np.testing.assert_allclose(unwhiten(w, whiten(w, rows)), rows, atol=2e-4)
+    np.testing.assert_allclose(w.root @ w.inverse, np.eye(F), atol=1e-3)
+
+
+@given(seeds, st.integers(10, N))
+def test_white_rows_have_zero_mean_and_identity_covariance(seed, size):
+    rows = correlated(seed)
+    w = whitener(jnp.asarray(rows), jnp.int32(size))
+    white = np.asarray(whiten(w, jnp.asarray(rows)), np.float64)[:size]
+    np.testing.assert_allclose(white.mean(0), 0, atol=1e-3)
+    np.testing.assert_allclose(np.cov(white.T, bias=True), np.eye(F), atol=3e-3)
+
+
+@given(seeds)
+def test_diagonal_whitening_scales_each_column_alone(seed):
+    rows = correlated(seed)
+    w = whitener(jnp.asarray(rows), jnp.int32(N), full=False)
+    np.testing.assert_allclose(whiten(w, rows), (rows - rows.mean(0)) / rows.std(0), atol=1e-4)
+
+
+@both
+@given(seed=seeds, size=st.integers(1, N - 1), junk=st.sampled_from([1e6, np.inf, np.nan]))
+def test_rows_beyond_size_do_not_matter(full, seed, size, junk):
+    rows = correlated(seed)
+    clean, dirty = rows.copy(), rows.copy()
+    clean[size:], dirty[size:] = 0, junk
+    for a, b in zip(*(whitener(jnp.asarray(r), jnp.int32(size), full=full) for r in (clean, dirty)), strict=True):
+        assert np.array_equal(a, b)
+
+
+@both
+@pytest.mark.parametrize("value", [0.0, 3.14, -1e4])
+def test_a_constant_column_stays_finite(full, value):
+    """An angle that has not moved yet; its mean in float32 may be off by a rounding."""
+    rows = correlated(0)
+    rows[:, 1] = value
+    w = whitener(jnp.asarray(rows), jnp.int32(N), full=full)
+    white = np.asarray(whiten(w, jnp.asarray(rows)))
+    assert np.all(np.isfinite(white))
+    assert np.max(np.abs(white)) < 10
+    np.testing.assert_allclose(unwhiten(w, white), rows, atol=1e-4 * max(1, abs(value)))
+
+
+@both
+def test_a_dependent_column_stays_finite(full):
+    rows = correlated(1)
+    rows[:, 2] = rows[:, 0] - 2 * rows[:, 1]
+    w = whitener(jnp.asarray(rows), jnp.int32(N), full=full)
+    white = np.asarray(whiten(w, jnp.asarray(rows)))
+    assert np.all(np.isfinite(white))
+    np.testing.assert_allclose(unwhiten(w, white), rows, atol=2e-3)
+
+
+@both
+@pytest.mark.parametrize("size", [0, 1, 2])
+def test_too_few_rows_stay_finite(full, size):
+    rows = np.zeros((N, F), np.float32)
+    rows[:size] = correlated(2)[:size]
+    w = whitener(jnp.asarray(rows), jnp.int32(size), full=full)
+    assert all(np.all(np.isfinite(part)) for part in w)
+    assert np.all(np.isfinite(whiten(w, rows[:size])))
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+def test_the_factor_is_lower_triangular_and_in_units_of_the_data(scale):
+    """The predicted noise is a fraction of the root's diagonal: it must scale with the data."""
+    rows = correlated(3) * np.float32(scale)
+    w = whitener(jnp.asarray(rows), jnp.int32(N))
+    assert np.array_equal(np.asarray(w.root), np.tril(w.root))
+    expected = np.linalg.cholesky(np.cov(rows.astype(np.float64).T, bias=True))
+    np.testing.assert_allclose(w.root, expected, rtol=2e-3, atol=2e-3 * scale)
