@@ -4,7 +4,8 @@ import jax
 import pytest
 from hypothesis import settings
 
-# A random key used twice raises, in jit, scan and vmap too: PEGASUS rests on knowing which draw is which.
+# A random key used twice raises, in jit and scan too: PEGASUS rests on knowing which draw is which. One false alarm is
+# known, in jax 0.10 and 0.12: vmap of a scan over split keys. probes.unchecked switches the check off for that.
 jax.config.update("jax_debug_key_reuse", True)
 
 # Derandomised: a failure in CI is the same failure here. No deadline: the first example compiles.

@@ -277,6 +277,16 @@ def rig(particles: int = 7, horizon: int = 4) -> Rig:
     return make_rig(particles, horizon)
 
 
+def unchecked(function: Any) -> Any:
+    """The function without the check for reused keys, which cries wolf at vmap of a scan over keys (jax 0.10, 0.12)."""
+
+    def call(*arguments):
+        with jax.debug_key_reuse(False):
+            return function(*arguments)
+
+    return call
+
+
 def same(a: Any, b: Any) -> bool:
     """Two pytrees are equal to the last bit."""
     first, second = jax.tree.leaves(a), jax.tree.leaves(b)

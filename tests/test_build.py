@@ -1,0 +1,163 @@
+"""Composition: every named choice builds, and what a config says reaches the piece it is about."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_jax import config, cost, moments, scenarios, settings, types
+from pegasus_jax.build import AGGREGATES, EXPLORATIONS, build, compose, dropout_of, start
+from pegasus_jax.config import ALGORITHMS, DROPOUTS, MODELS, POLICIES, Config, Period, SettingError
+from pegasus_jax.dynamics.bnn import HEADS
+from pegasus_jax.network import INITIALISERS
+from pegasus_jax.policy.squash import SQUASHES
+from pegasus_jax.search import objective
+from pegasus_jax.trial import SEARCH, trial_key
+from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, tiny
+
+
+def test_the_choices_of_a_config_are_the_pieces_there_are():
+    """config.py cannot import the pieces; it lists their names, and this keeps the lists true."""
+    assert tuple(HEADS) == config.HEADS
+    assert tuple(INITIALISERS) == config.INITIALISERS
+    assert tuple(SQUASHES) == config.SQUASHES
+    assert tuple(EXPLORATIONS) == config.EXPLORATIONS
+    assert tuple(AGGREGATES) == config.AGGREGATES
+
+
+@pytest.mark.parametrize("kind", DROPOUTS)
+def test_every_dropout_is_the_one_of_its_name(kind):
+    """By its parameters and its mean; an unknown name must not fall through to no noise."""
+    noise = dropout_of(config.BNN(dropout=kind, rate=0.3, low=-4.0, high=0.5))
+    params = noise.init(jax.random.key(0), 5)
+    names = dict(log_normal={"location", "scale"}, concrete={"logit"}, gaussian={"logit"}, sparse={"position"})
+    assert set(params) == names.get(kind, set())
+    mean = np.asarray(noise.retain(params))
+    if kind in ("binary", "concrete"):
+        np.testing.assert_allclose(mean, 0.7, atol=0.01)  # the rate is the one given
+    if kind == "log_normal":
+        tall = noise.mask({name: jnp.full(5, 50.0) for name in params}, jnp.full(5, 0.999999))
+        np.testing.assert_allclose(tall, np.exp(0.5), rtol=1e-3)  # and so is the interval
+
+
+@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("policy", POLICIES)
+def test_every_variant_has_the_shapes_of_the_loop(model, policy):
+    """eval_shape traces the loop without compiling it."""
+    chosen = dataclasses.replace(tiny(), model=MODELS[model], policy=POLICIES[policy])
+    exp = compose(chosen, dial())
+    state = jax.eval_shape(exp.init, jax.random.key(0))
+    state = jax.eval_shape(exp.absorb, state, jax.eval_shape(exp.collect, state))
+    improved, _ = jax.eval_shape(exp.improve, state)
+    assert jax.tree.structure(improved) == jax.tree.structure(state)
+    shapes = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)] for tree in (improved, state)]
+    assert shapes[0] == shapes[1]
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_every_algorithm_is_a_matter_of_periods_particles_and_clipping(algorithm):
+    chosen = settings.parse({"algorithm": algorithm})
+    if algorithm == "pegasus":
+        assert chosen.search.period == Period(start=1, dynamics=0, policy=0, sensor=0, match=0)
+        assert (chosen.search.particles, chosen.search.clip) == (100, 1.0)
+    else:  # Alg. 2
+        assert chosen.search.period == Period(1, 1, 1, 1, 1)
+        assert (chosen.search.particles, chosen.search.clip) == (10, None)
+    jax.eval_shape(compose(dataclasses.replace(tiny(), search=chosen.search), cart()).init, jax.random.key(0))
+
+
+def test_a_config_is_built_once():
+    """A tuple of functions hashes by identity: built twice, everything would compile twice."""
+    one, two = build(Config()), build(Config())
+    assert one is two
+    assert build(Config(seed=1)).task.name == "cartpole"
+
+
+def test_the_data_set_has_room_for_the_whole_run():
+    state = jax.eval_shape(compose(tiny(trials=7), cart(horizon=5)).init, jax.random.key(0))
+    assert state.data.x.shape == (35, 2)
+
+
+def test_your_own_model_and_policy_take_the_place_of_the_configured_ones():
+    dynamics, policy = known(SCALAR), linear_policy(1, 1)
+    exp = compose(tiny(), dial(), dynamics=dynamics, policy=policy)
+    assert exp.dynamics is dynamics
+    assert exp.policy is policy
+
+
+@pytest.mark.parametrize(
+    ("search", "part"),
+    [
+        (dict(particles=2, match=True), "search.particles=2"),
+        (dict(particles=2, match=False, balanced=True), "search.particles=2"),
+    ],
+)
+def test_too_few_particles_for_a_covariance_are_refused(search, part):
+    """Two particles span a line; matching, or balancing, in the two dimensions of the cart would divide by zero."""
+    chosen = dataclasses.replace(tiny(), search=config.Search(**search))
+    with pytest.raises(SettingError, match=part):
+        compose(chosen, cart())
+
+
+# What reaches the search, seen on pieces that compile in no time: a linear model, noisy, and a linear policy
+
+
+def searcher(**search):
+    """A state with a gain that is not zero, and a one-step search from it."""
+    chosen = dataclasses.replace(tiny(), search=config.Search(**{"steps": 1, "particles": 5, **search}))
+    policy = linear_policy(2, 1)._replace(init=lambda key: jnp.array([[-0.5, -0.8]]))
+    exp = compose(chosen, cart(horizon=4), dynamics=known(PENDULUM, noise_std=0.2), policy=policy)
+    return exp, exp.init(jax.random.key(0)), jax.jit(exp.search)
+
+
+def first_objective(**search):
+    _, state, run = searcher(**search)
+    return float(run(state)[1].objective[0])
+
+
+def test_settings_of_the_search_reach_the_objective():
+    plain = first_objective()
+    changes = dict(match=False, balanced=True, discount=0.5, aggregate="total")
+    changes |= dict(policy_noise=0.0, state_noise=1.0, cost_noise=1.0)
+    values = {name: first_objective(**{name: value}) for name, value in changes.items()}
+    np.testing.assert_allclose(values.pop("aggregate"), 4 * plain, rtol=1e-4)  # the sum over 4 steps
+    assert values["discount"] < 0.7 * plain
+    assert all(abs(value - plain) > 1e-6 for value in values.values()), values
+    assert len(set(values.values())) == len(values)
+
+
+def test_as_few_particles_as_are_allowed_do():
+    assert np.isfinite(first_objective(particles=3, balanced=True))
+
+
+def test_clipping_reaches_the_optimiser():
+    """Adam's step hides the size of a gradient; its first moment, a tenth of what it was given, does not."""
+    moved = {}
+    for clip in (None, 1e-6):
+        _, state, run = searcher(clip=clip)
+        state, info = run(state)
+        moved[clip] = float(jnp.linalg.norm(state.policy.optimizer.inner_state[1][0].mu))
+        assert info.gradient_norm[0] > 1e-4
+    np.testing.assert_allclose(moved[None], 0.1 * info.gradient_norm[0], rtol=1e-3)
+    np.testing.assert_allclose(moved[1e-6], 0.1 * 1e-6, rtol=1e-3)
+
+
+def test_the_search_minimises_what_objective_says():
+    """The first objective of a search is `objective` of the public pieces, put together by hand."""
+    exp, state, run = searcher()
+    pieces = dict(dynamics=exp.dynamics, policy=exp.policy)
+    of_task = partial(start, task=exp.task)
+    blocks = scenarios.blocks(**pieces, start=of_task, particles=5, horizon=4, balanced=False)
+    given = scenarios.draw(trial_key(state.key, 0, SEARCH), 0, None, blocks=blocks, period=types.Period())
+    of_particles = cost.of_particles(exp.task.cost)
+    by_hand = objective(state.policy.params, None, given, **pieces, match=moments.match, cost=of_particles)
+    np.testing.assert_allclose(run(state)[1].objective[0], by_hand, rtol=1e-5)
+
+
+def test_first_states_are_those_of_the_task():
+    x = np.asarray(jax.vmap(partial(start, task=cart()))(jax.random.split(jax.random.key(0), 2000)))
+    np.testing.assert_allclose(x.mean(0), [1.0, 0.0], atol=0.02)
+    np.testing.assert_allclose(x.std(0), [0.1, 0.1], atol=0.02)

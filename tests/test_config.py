@@ -1,0 +1,105 @@
+"""Config values: frozen, hashable, and checked when they are made."""
+
+import dataclasses
+import math
+
+import pytest
+
+from pegasus_jax import config
+from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search, SettingError, nearest
+
+
+def test_a_config_is_a_key():
+    """What `build` is cached on: equal configs are one key, and nobody can change one after the fact."""
+    assert hash(Config()) == hash(Config())
+    assert Config() == Config()
+    assert len({Config(), Config(seed=1), Config(), dataclasses.replace(Config(), fit=Fit(steps=1))}) == 3
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        Config().seed = 1  # type: ignore[misc]
+
+
+def test_layers_given_as_a_list_are_still_hashable():
+    assert BNN(hidden=[50, 50]) == BNN(hidden=(50, 50))  # type: ignore[arg-type]
+    assert hash(MLP(hidden=[50, 50])) == hash(MLP(hidden=(50, 50)))  # type: ignore[arg-type]
+
+
+def test_the_defaults_are_the_papers_cartpole_runs():
+    """Reference settings 1.2, 4.2, 4.7, 5.2: a change here changes every result."""
+    c = Config()
+    assert (c.model.hidden, c.model.dropout, c.model.heteroscedastic, c.model.whitening) == (
+        (200, 200),
+        "log_normal",
+        True,
+        "full",
+    )
+    assert (c.policy.hidden, c.policy.dropout, c.policy.execution) == ((200, 200), 0.1, "sampled")
+    assert (c.fit.steps, c.fit.batch, c.fit.learning_rate, c.fit.reset) == (2000, 100, 1e-4, False)
+    assert (c.search.steps, c.search.particles, c.search.learning_rate, c.search.clip) == (1000, 100, 1e-3, 1.0)
+    assert (c.search.match, c.search.aggregate, c.search.discount) == (True, "mean", 1.0)
+    assert c.search.period == Period(start=1, dynamics=0, policy=0, sensor=0, match=0)
+    assert (c.explore.trials, c.explore.kind) == (1, "uniform")
+
+
+IMPOSSIBLE = [
+    (BNN, dict(hidden=(50, 0)), "model.hidden=0"),
+    (BNN, dict(dropout="lognormal"), "'log_normal'"),
+    (BNN, dict(head="sigmoidal"), "'sigmoid'"),
+    (BNN, dict(whitening="Full"), "'full'"),
+    (BNN, dict(initialiser="glorrot"), "'glorot'"),
+    (BNN, dict(rate=1.0), "the nearest is 0.99"),
+    (BNN, dict(rate=-0.1), "the nearest is 0"),
+    (BNN, dict(weight_decay=-1.0), "model.weight_decay=-1"),
+    (BNN, dict(low=0.0), "model.low=0"),
+    (BNN, dict(low=-math.inf), "model.low=-inf"),
+    (BNN, dict(low=math.nan), "model.low=nan"),
+    (BNN, dict(high=math.inf), "model.high=inf"),
+    (MLP, dict(hidden=(-3,)), "policy.hidden=-3"),
+    (MLP, dict(squash="tan"), "'tanh'"),
+    (MLP, dict(execution="average"), "sampled, mean"),
+    (MLP, dict(dropout=1.0), "the nearest is 0.99"),
+    (MLP, dict(output_scale=0.0), "policy.output_scale=0"),
+    (Fit, dict(steps=0), "the nearest is 1"),
+    (Fit, dict(batch=0), "fit.batch=0"),
+    (Fit, dict(learning_rate=0.0), "(0, inf)"),
+    (Fit, dict(learning_rate=math.nan), "fit.learning_rate=nan"),
+    (Period, dict(start=-1), "search.period.start=-1"),
+    (Period, dict(match=-2), "search.period.match=-2"),
+    (Search, dict(steps=0), "search.steps=0"),
+    (Search, dict(particles=1), "the nearest is 2"),
+    (Search, dict(learning_rate=-1e-3), "search.learning_rate=-0.001"),
+    (Search, dict(clip=0.0), "search.clip=0"),
+    (Search, dict(discount=1.01), "(0, 1]"),
+    (Search, dict(aggregate="sum"), "mean, total"),
+    (Search, dict(state_noise=-1.0), "search.state_noise=-1"),
+    (Explore, dict(trials=-1), "explore.trials=-1"),
+    (Explore, dict(kind="walking"), "'walk'"),
+    (Config, dict(seed=-1), "seed=-1"),
+    (Config, dict(seed=2**32), "the nearest is 4294967295"),
+    (Config, dict(trials=0), "trials=0"),
+    (Config, dict(trials=10**6), "the nearest is 10000"),
+]
+
+
+@pytest.mark.parametrize(("kind", "fields", "part"), IMPOSSIBLE)
+def test_an_impossible_value_is_named_in_one_line(kind, fields, part):
+    with pytest.raises(SettingError) as caught:
+        kind(**fields)
+    message = str(caught.value)
+    assert part in message
+    assert "\n" not in message
+    assert next(iter(fields)) in message
+
+
+def test_limits_themselves_are_possible():
+    BNN(rate=0.0, weight_decay=0.0)
+    BNN(rate=0.99, hidden=(1,))
+    MLP(dropout=0.0)
+    Fit(steps=1, batch=1, learning_rate=1e-12)
+    Search(steps=1, particles=2, clip=None, discount=1.0)
+    Explore(trials=0)
+    Config(seed=2**32 - 1, trials=1)
+
+
+def test_the_nearest_choice():
+    assert nearest("lognormal", config.DROPOUTS) == f"did you mean 'log_normal'? choices: {', '.join(config.DROPOUTS)}"
+    assert nearest("xyz", ("tanh", "sine")) == "choices: tanh, sine"

@@ -1,0 +1,358 @@
+"""The command line's words: every public spelling means what it says, and a wrong one ends in one useful line."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pegasus_jax import config, settings
+from pegasus_jax.build import compose
+from pegasus_jax.config import (
+    ALGORITHMS,
+    BNN,
+    MLP,
+    MODELS,
+    POLICIES,
+    Config,
+    Explore,
+    Fit,
+    Period,
+    Search,
+    SettingError,
+)
+from pegasus_jax.tasks import TASKS
+from probes import cart
+
+
+def parse(*words):
+    _, rest = settings.split(words, ("out", "resume"))
+    return settings.parse(rest, options=("out", "resume"))
+
+
+def value(chosen, key):
+    return settings.leaves(chosen)[key]
+
+
+# The spellings of the issue and of the help text
+
+
+SPELLINGS = [
+    ("task=cartpole", "task", "cartpole"),
+    ("policy.hidden=[50,50]", "policy.hidden", (50, 50)),
+    ("policy.hidden=[ 50, 60 ]", "policy.hidden", (50, 60)),
+    ("policy.hidden=[7]", "policy.hidden", (7,)),
+    ("seed=3", "seed", 3),
+    ("seed=4294967295", "seed", 2**32 - 1),
+    ("trials=10", "trials", 10),
+    ("model.dropout=log_normal", "model.dropout", "log_normal"),
+    ("model.dropout=binary", "model.dropout", "binary"),
+    ("model.dropout=none", "model.dropout", "none"),
+    ("model.rate=.2", "model.rate", 0.2),
+    ("model.low=-4", "model.low", -4.0),
+    ("model.input_noise=true", "model.input_noise", True),
+    ("model.heteroscedastic=false", "model.heteroscedastic", False),
+    ("model.head=softplus", "model.head", "softplus"),
+    ("model.whitening=diagonal", "model.whitening", "diagonal"),
+    ("policy.dropout=.1", "policy.dropout", 0.1),
+    ("policy.dropout=0", "policy.dropout", 0.0),
+    ("policy.squash=sine", "policy.squash", "sine"),
+    ("policy.execution=mean", "policy.execution", "mean"),
+    ("fit.steps=500", "fit.steps", 500),
+    ("fit.batch=64", "fit.batch", 64),
+    ("fit.learning_rate=1e-3", "fit.learning_rate", 1e-3),
+    ("fit.reset=true", "fit.reset", True),
+    ("search.steps=200", "search.steps", 200),
+    ("search.particles=50", "search.particles", 50),
+    ("search.learning_rate=.001", "search.learning_rate", 1e-3),
+    ("search.clip=1", "search.clip", 1.0),
+    ("search.clip=0.5", "search.clip", 0.5),
+    ("search.clip=null", "search.clip", None),
+    ("search.match=false", "search.match", False),
+    ("search.balanced=true", "search.balanced", True),
+    ("search.aggregate=total", "search.aggregate", "total"),
+    ("search.period.start=5", "search.period.start", 5),
+    ("search.period.dynamics=1", "search.period.dynamics", 1),
+    ("search.period.policy=2", "search.period.policy", 2),
+    ("search.period.sensor=3", "search.period.sensor", 3),
+    ("search.period.match=500", "search.period.match", 500),
+    ("explore.trials=2", "explore.trials", 2),
+    ("explore.kind=walk", "explore.kind", "walk"),
+]
+
+
+@pytest.mark.parametrize(("word", "key", "expected"), SPELLINGS)
+def test_a_setting_changes_itself_and_nothing_else(word, key, expected):
+    chosen, default = settings.leaves(parse(word)), settings.leaves(Config())
+    assert chosen[key] == expected
+    assert type(chosen[key]) is type(expected)
+    assert {k: v for k, v in chosen.items() if k != key} == {k: v for k, v in default.items() if k != key}
+
+
+def test_no_word_gives_the_defaults():
+    assert parse() == parse("task=cartpole", "algorithm=pegasus") == Config()
+
+
+def test_every_setting_has_a_spelling():
+    """Its own default, written as the help text writes it, changes nothing; and the help names each."""
+    text = "\n".join(settings.help_lines(Config()))
+    for key, default in settings.leaves(Config()).items():
+        assert parse(f"{key}={settings._text(default)}") == Config()
+        if key != "task":
+            assert f"  {key}={settings._text(default)} " in text
+
+
+VARIANTS = [
+    *((f"model={name}", "model", variant) for name, variant in MODELS.items()),
+    *((f"policy={name}", "policy", variant) for name, variant in POLICIES.items()),
+]
+
+
+@pytest.mark.parametrize(("word", "section", "variant"), VARIANTS)
+def test_a_variant_is_its_section(word, section, variant):
+    assert parse(word) == dataclasses.replace(Config(), **{section: variant})
+
+
+def test_a_variant_brings_defaults_that_single_settings_change():
+    """In any order on the line."""
+    words = "model=binary", "algorithm=deep_pilco", "search.clip=1", "model.rate=.3", "search.period.match=0"
+    for order in (words, words[::-1]):
+        chosen = parse(*order)
+        assert chosen.model == BNN(dropout="binary", rate=0.3)
+        assert chosen.search == Search(particles=10, clip=1.0, period=Period(1, 1, 1, 1, 0))
+
+
+def test_options_are_kept_from_the_settings():
+    known, rest = settings.split(["out=runs/a=b", "seed=3", "resume="], ("out", "resume"))
+    assert known == {"out": "runs/a=b", "resume": ""}
+    assert rest == {"seed": "3"}
+
+
+# What cannot be. (words, parts of the message)
+
+WRONG = [
+    # not of the form
+    (["cartpole"], ["'cartpole' is not of the form key=value"]),
+    (["--trials"], ["'--trials' is not of the form key=value", "did you mean 'trials'?"]),
+    (["=3"], ["'=3' is not of the form"]),
+    # unknown variants
+    (["task=cartpol"], ["task=cartpol is unknown", "did you mean 'cartpole'?"]),
+    (["model=lognormal"], ["model=lognormal is unknown", "did you mean 'log_normal'?"]),
+    (["policy=drop_mlp"], ["did you mean 'dropout_mlp'?", "choices: dropout_mlp, mlp"]),
+    (["algorithm=pilco"], ["algorithm=pilco is unknown", "did you mean 'deep_pilco'?"]),
+    (["task="], ["task= is unknown", "cartpole"]),
+    # unknown keys
+    (["polcy=mlp"], ["polcy is not a setting", "did you mean 'policy'?"]),
+    (["policy.hiden=[50]"], ["did you mean 'policy.hidden'?"]),
+    (["search.perod.start=1"], ["did you mean 'search.period.start'?"]),
+    (["seeds=3"], ["did you mean 'seed'?"]),
+    (["search.period=1"], ["search.period is not a setting"]),
+    (["model.hidden.x=1"], ["model.hidden.x is not a setting", "did you mean 'model.hidden'?"]),
+    (["ouut=runs/a"], ["did you mean 'out'?"]),
+    (["zzzzzz=1"], ["zzzzzz is not a setting", "--help lists all settings"]),
+    # wrong types
+    (["trials=many"], ["trials=many is not a whole number", "for example trials=15"]),
+    (["trials=2.5"], ["trials=2.5 is not a whole number"]),
+    (["trials="], ["trials=", "is not a whole number"]),
+    (["trials=[3]"], ["is not a whole number"]),
+    (["trials=true"], ["trials=true is not a whole number"]),
+    (["fit.learning_rate=fast"], ["fit.learning_rate=fast is not a number"]),
+    (["model.rate={a: 1}"], ["model.rate=", "is not a number"]),
+    (["search.clip=none"], ["search.clip=none is not a number or null"]),
+    (["fit.reset=maybe"], ["fit.reset=maybe is not true or false"]),
+    (["policy.hidden=50"], ["policy.hidden=50 is not a list of whole numbers", "for example policy.hidden=[200,200]"]),
+    (["policy.hidden=[50,wide]"], ["is not a list of whole numbers"]),
+    (["policy.hidden=[50.5]"], ["is not a list of whole numbers"]),
+    (["policy.hidden=[50,"], ["policy.hidden=[50, cannot be read"]),
+    (["policy.hidden={a: 1}"], ["policy.hidden=", "is not a list of whole numbers"]),
+    (["policy.hidden=null"], ["is not a list of whole numbers"]),
+    (["model.dropout=[1]"], ["model.dropout=[1] is not a word"]),
+    (["model.dropout=null"], ["model.dropout=null is not a word"]),
+    (["seed=${trials}"], ["seed=", "is not a whole number"]),
+    # impossible values
+    (["trials=0"], ["trials=0 is out of range", "the nearest is 1"]),
+    (["seed=-1"], ["seed=-1", "the nearest is 0"]),
+    (["seed=99999999999"], ["seed=99999999999 ", "the nearest is 4294967295"]),
+    (["policy.dropout=1.5"], ["policy.dropout=1.5 is out of range", "the nearest is 0.99"]),
+    (["policy.hidden=[50,0]"], ["policy.hidden", "the nearest is 1"]),
+    (["search.particles=1"], ["search.particles=1", "the nearest is 2"]),
+    (["search.clip=0"], ["search.clip=0 is out of range", "(0, inf)"]),
+    (["search.clip=.inf"], ["search.clip=inf is out of range"]),
+    (["search.period.match=-1"], ["search.period.match=-1", "the nearest is 0"]),
+    (["search.discount=0"], ["search.discount=0", "(0, 1]"]),
+    (["model.dropout=lognormal"], ["model.dropout=lognormal is not a choice", "did you mean 'log_normal'?"]),
+    (["policy.squash=tan"], ["did you mean 'tanh'?", "choices: tanh, sine"]),
+    (["model.low=1"], ["model.low=1 must be less than model.high=0"]),
+    (["model.low=-.inf"], ["model.low=-inf"]),
+    (["fit.learning_rate=.nan"], ["fit.learning_rate=nan is out of range"]),
+]
+
+
+@pytest.mark.parametrize(("words", "parts"), WRONG, ids=[" ".join(words) for words, _ in WRONG])
+def test_a_wrong_word_ends_in_one_line_that_helps(words, parts):
+    with pytest.raises(SettingError) as caught:
+        parse(*words)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert len(message) < 300
+    for part in parts:
+        assert part in message, message
+
+
+def fate(word):
+    """What a word ends in: a config, or the lines of a refusal."""
+    try:
+        return parse(word)
+    except SettingError as error:
+        return str(error).splitlines()
+
+
+@given(st.sampled_from(sorted(settings.leaves(Config()))), st.text(max_size=12))
+def test_any_text_ends_in_a_config_or_in_one_line(key, text):
+    end = fate(f"{key}={text}")
+    assert isinstance(end, Config) or len(end) == 1
+
+
+NESTED = ["[1,[2]]", "{a: {b: 1}}", "{a: 1}", "[]", "{}", "[null]", "[true]", "???", "${x}", "!!python/none", "&a [*a]"]
+NESTED += ["2026-01-01", "0x10", "1_0", "first\nsecond"]
+
+
+@pytest.mark.parametrize("key", ["seed", "model.hidden", "model.dropout", "model.rate", "search.clip", "fit.reset"])
+@pytest.mark.parametrize("text", NESTED)
+def test_any_yaml_ends_in_a_config_or_in_one_line(key, text):
+    end = fate(f"{key}={text}")
+    assert isinstance(end, Config) or len(end) == 1
+
+
+# Settings that are each possible and not together with what the pieces can do: before anything is written, one line
+
+TOGETHER = [
+    ["model.low=-.01"],  # narrower than the least scale of its noise
+    ["model=concrete", "model.rate=0"],
+    ["search.particles=2"],
+    ["search.particles=2", "search.match=false", "search.balanced=true"],
+]
+
+
+@pytest.mark.parametrize("words", TOGETHER, ids=" ".join)
+def test_settings_that_no_piece_can_obey_end_in_one_line_too(words):
+    with pytest.raises(SettingError) as caught:
+        compose(parse(*words), cart())
+    assert "\n" not in str(caught.value)
+    assert words[-1].partition("=")[0].split(".")[-1] in str(caught.value) or "particles" in str(caught.value)
+
+
+INTERVALS = [["model.low=1", "model.high=5"], ["model.high=5", "model.low=1"], ["model.high=-12", "model.low=-20"]]
+
+
+@pytest.mark.parametrize("words", INTERVALS, ids=" ".join)
+def test_both_ends_of_an_interval_may_move_past_the_others_default(words):
+    """Each alone is impossible beside the other's default; together, in either order, they are a fine interval."""
+    chosen = parse(*words)
+    assert {f"model.low={chosen.model.low:g}", f"model.high={chosen.model.high:g}"} == set(words)
+
+
+@pytest.mark.parametrize("ends", [(1.0, 5.0), (-20.0, -12.0)])
+def test_any_interval_survives_the_file(ends, tmp_path):
+    chosen = Config(model=BNN(low=ends[0], high=ends[1]))
+    settings.save(chosen, tmp_path / "config.yaml")
+    assert settings.load(tmp_path / "config.yaml") == chosen
+
+
+# Saving and loading
+
+positive = st.floats(1e-6, 1e3)
+whole = partial(st.integers, max_value=10**6)
+layers = st.lists(st.integers(1, 500), max_size=4).map(tuple)
+configs = st.builds(
+    Config,
+    task=st.sampled_from(sorted(TASKS)),
+    seed=st.integers(0, 2**32 - 1),
+    trials=st.integers(1, 10_000),
+    model=st.builds(
+        BNN,
+        low=st.floats(-20, -0.1),
+        high=st.floats(0, 3),
+        hidden=layers,
+        dropout=st.sampled_from(config.DROPOUTS),
+        rate=st.floats(0, 0.99),
+        input_noise=st.booleans(),
+        heteroscedastic=st.booleans(),
+        head=st.sampled_from(config.HEADS),
+        whitening=st.sampled_from(["full", "diagonal"]),
+        weight_decay=st.floats(0, 10),
+        initialiser=st.sampled_from(config.INITIALISERS),
+    ),
+    policy=st.builds(
+        MLP,
+        hidden=layers,
+        dropout=st.floats(0, 0.99),
+        squash=st.sampled_from(config.SQUASHES),
+        execution=st.sampled_from(config.EXECUTIONS),
+        output_scale=positive,
+        initialiser=st.sampled_from(config.INITIALISERS),
+    ),
+    fit=st.builds(Fit, steps=whole(1), batch=whole(1), learning_rate=positive, reset=st.booleans()),
+    search=st.builds(
+        Search,
+        steps=whole(1),
+        particles=whole(2),
+        learning_rate=positive,
+        clip=st.none() | positive,
+        match=st.booleans(),
+        balanced=st.booleans(),
+        aggregate=st.sampled_from(config.AGGREGATES),
+        discount=st.floats(0.01, 1),
+        reset=st.booleans(),
+        policy_noise=st.floats(0, 10),
+        state_noise=st.floats(0, 10),
+        cost_noise=st.floats(0, 10),
+        period=st.builds(Period, *[whole(0)] * 5),
+    ),
+    explore=st.builds(Explore, trials=whole(0), kind=st.sampled_from(config.EXPLORATIONS)),
+)
+
+
+@given(chosen=configs)
+def test_a_saved_config_is_loaded_to_the_last_bit(chosen, tmp_path_factory):
+    path = tmp_path_factory.mktemp("config") / "config.yaml"
+    settings.save(chosen, path)
+    assert settings.load(path) == chosen
+
+
+NO_CONFIGS = {
+    "prose": "no config",
+    "list": "[1, 2]",
+    "broken": "seed: [",
+    "unknown": "colour: red",
+    "wrong type": "seed: many",
+    "impossible": "trials: 0",
+    "nested": "policy.hidden: {a: 1}",
+    "empty": "",  # a machine that lost power while writing
+}
+
+
+@pytest.mark.parametrize("name", NO_CONFIGS)
+def test_a_file_that_is_no_config_says_so(name, tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(NO_CONFIGS[name], encoding="utf-8")
+    with pytest.raises(SettingError) as caught:
+        settings.load(path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_missing_config_says_so(tmp_path):
+    with pytest.raises(SettingError, match=r"config\.yaml"):
+        settings.load(tmp_path / "config.yaml")
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_what_was_parsed_survives_the_file(algorithm, tmp_path):
+    chosen = parse(f"algorithm={algorithm}", "model=sparse", "policy=mlp", "policy.hidden=[3]", "seed=7")
+    settings.save(chosen, tmp_path / "config.yaml")
+    loaded = settings.load(tmp_path / "config.yaml")
+    assert loaded == chosen
+    assert hash(loaded) == hash(chosen)
+    assert jax.tree.leaves(settings.override(loaded, {"trials": 20}).trials) == [20]

@@ -1,0 +1,280 @@
+"""The loop of Alg. 1: three seams that compose, one scan that equals them, and keys that no two purposes share."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_jax.build import compose, dynamics_of, policy_of
+from pegasus_jax.config import Period
+from pegasus_jax.trial import COLLECT, EVALUATE, FIT, IMAGINE, SEARCH, TrialInfo, run, trial_key
+from probes import cart, dial, same, tiny, unchecked
+
+TRIALS, EPISODES = 3, 4
+QUICK = dict(
+    fit__steps=12, search__steps=6, search__particles=5, model__hidden=(6,), policy__hidden=(6,), trials=TRIALS
+)
+
+
+class Counter:
+    """How often Python went through a function: once a trace."""
+
+    def __init__(self, function):
+        self.function, self.count = function, 0
+
+    def __call__(self, *arguments):
+        self.count += 1
+        return self.function(*arguments)
+
+
+class Watched:
+    """A quick experiment whose model and policy count their traces, with its seams jitted."""
+
+    def __init__(self):
+        config, task = tiny(**QUICK), cart()
+        dynamics, policy = dynamics_of(config.model, task), policy_of(config.policy, task)
+        self.loss, self.predict, self.act = Counter(dynamics.loss), Counter(dynamics.apply), Counter(policy.apply)
+        self.exp = compose(
+            config,
+            task,
+            dynamics._replace(loss=self.loss, apply=self.predict),
+            policy._replace(apply=self.act),
+        )
+        self.init, self.collect = jax.jit(self.exp.init), jax.jit(self.exp.collect)
+        self.absorb, self.fit = jax.jit(self.exp.absorb), jax.jit(self.exp.fit)
+        self.search = jax.jit(self.exp.search)
+        self.episodes = unchecked(jax.jit(jax.vmap(self.exp.episode, (0, None, None))))
+
+    def traces(self):
+        return self.loss.count, self.predict.count, self.act.count
+
+
+@pytest.fixture(scope="module")
+def watched():
+    return Watched()
+
+
+def loop(watched, seed):
+    """Three trials as a Python loop over the seams: (states, infos, traces after each trial)."""
+    state = watched.init(jax.random.key(seed))
+    states, infos, traces = [state], [], []
+    for _ in range(TRIALS):
+        trajectory = watched.collect(state)
+        state = watched.absorb(state, trajectory)
+        state, fitted = watched.fit(state)
+        state, searched = watched.search(state)
+        keys = jax.random.split(trial_key(state.key, state.trial, EVALUATE), EPISODES)
+        evaluation = watched.episodes(keys, state.policy.params, False)
+        states.append(state)
+        infos.append(TrialInfo(trajectory, evaluation.cost, fitted, searched))
+        traces.append(watched.traces())
+    return states, infos, traces
+
+
+@pytest.fixture(scope="module")
+def looped(watched):
+    return loop(watched, 5)
+
+
+def close(a, b, tolerance=2e-3):
+    for p, q in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        if not jnp.issubdtype(p.dtype, jax.dtypes.prng_key):
+            np.testing.assert_allclose(p, q, rtol=tolerance, atol=tolerance)
+
+
+def test_nothing_is_traced_again_from_trial_to_trial(looped):
+    _, _, traces = looped
+    assert all(count > 0 for count in traces[0])
+    assert traces[1] == traces[2] == traces[0]
+
+
+def test_a_study_of_many_seeds_as_one_program_is_the_loops_one_by_one(watched, looped):
+    """`improve` is search after fit, `trial` is collect, absorb, improve, and `run` a scan of so many trials."""
+    study = unchecked(jax.jit(jax.vmap(run(watched.exp, TRIALS, EPISODES))))
+    final, info = study(jnp.stack([jax.random.key(5), jax.random.key(6)]))
+    for i, (states, infos, _) in enumerate((looped, loop(watched, 6))):
+        close(jax.tree.map(lambda leaf, i=i: leaf[i], final), states[-1])
+        close(jax.tree.map(lambda leaf, i=i: leaf[i], info), jax.tree.map(lambda *rows: jnp.stack(rows), *infos))
+    assert same(final.key, jnp.stack([jax.random.key(5), jax.random.key(6)]))  # the root key never changes
+    assert info.evaluation.shape == (2, TRIALS, EPISODES, 8)
+    assert not np.allclose(info.evaluation[0], info.evaluation[1])
+
+
+def test_every_episode_becomes_data_once_and_evaluations_never(looped):
+    states, infos, _ = looped
+    for t, state in enumerate(states):
+        assert int(state.trial) == t
+        assert int(state.data.size) == 8 * t
+    flown = np.concatenate([info.trajectory.x[:-1] for info in infos])
+    assert np.array_equal(states[-1].data.x, flown)
+    assert np.array_equal(states[-1].data.u, np.concatenate([info.trajectory.u for info in infos]))
+    np.testing.assert_allclose(states[-1].data.y[:8], np.diff(infos[0].trajectory.x, axis=0), atol=1e-6)
+
+
+def test_the_seams_keep_to_their_part_of_the_state(watched, looped):
+    """collect changes nothing, absorb the data, fit the model, search the policy."""
+    before = looped[0][1]
+    absorbed = watched.absorb(before, watched.collect(before))
+    fitted, _ = watched.fit(absorbed)
+    searched, _ = watched.search(fitted)
+    parts = ("key", "data", "model", "policy", "trial")
+    changes = [
+        {part for part in parts if not same(getattr(a, part), getattr(b, part))}
+        for a, b in ((before, absorbed), (absorbed, fitted), (fitted, searched))
+    ]
+    assert changes == [{"data", "trial"}, {"model"}, {"policy"}]
+
+
+def test_a_trial_is_a_function_of_state_alone(watched, looped):
+    """Resume is exact: the state after trial 2, and nothing else, decides trial 3."""
+    states, infos, _ = looped
+    trajectory = watched.collect(states[2])
+    assert same(trajectory, infos[2].trajectory)
+    state, fitted = watched.fit(watched.absorb(states[2], trajectory))
+    state, searched = watched.search(state)
+    assert same(state, states[3])
+    assert same((fitted, searched), infos[2][2:])
+
+
+def test_a_search_in_pieces_is_the_search(watched, looped):
+    """Also where it forgets Adam's moments, which only its first piece may do."""
+    fitted, _ = watched.fit(watched.absorb(looped[0][1], watched.collect(looped[0][1])))
+    whole, info = watched.search(fitted)
+    part = jax.jit(partial(watched.exp.search, steps=3))
+    middle, first = part(fitted, 0)
+    end, second = part(middle, 3)
+    assert same(whole, end)
+    assert np.array_equal(info.objective, np.concatenate([first.objective, second.objective]))
+
+
+def test_the_first_episodes_are_random_controls_within_limits(watched, looped):
+    """Exploring, the policy has no say; afterwards it has all of it."""
+    states, infos, _ = looped
+    task = watched.exp.task
+    for t in (0, 1):
+        other = states[t]._replace(policy=states[t].policy._replace(params=states[3].policy.params))
+        u, u_other = watched.collect(states[t]).u, watched.collect(other).u
+        assert np.array_equal(u, u_other) == (t == 0)
+    u = np.asarray(infos[0].trajectory.u)
+    assert np.all((u >= task.control_low) & (u <= task.control_high))
+    assert len(np.unique(u)) == len(u)
+
+
+def test_evaluation_never_explores(watched, looped):
+    """Its controls are the policy's at every observed state: here without noise, so they can be computed."""
+    config = tiny(**QUICK, policy__execution="mean")
+    exp = compose(config, cart())
+    params = looped[0][3].policy.params
+    fly = jax.jit(exp.episode)
+    flight = fly(jax.random.key(1), params, False)
+    mean = jax.vmap(exp.policy.apply, (None, None, 0))(params, None, flight.x[:-1])
+    np.testing.assert_allclose(flight.u, mean, atol=1e-5)
+    sampled = watched.episodes(jnp.stack([jax.random.key(1)]), params, False)
+    means = jax.vmap(exp.policy.apply, (None, None, 0))(params, None, sampled.x[0, :-1])
+    assert not np.allclose(sampled.u[0], means, atol=1e-3)  # a mask of its own at each step
+
+
+def test_forgetting_adams_moments_or_not(watched, looped):
+    """fit warm-starts its optimiser, search does not, and both can be told otherwise."""
+    state = watched.absorb(looped[0][2], watched.collect(looped[0][2]))
+    fresh = watched.init(jax.random.key(0))
+    forgot = state._replace(
+        model=state.model._replace(optimizer=fresh.model.optimizer),
+        policy=state.policy._replace(optimizer=fresh.policy.optimizer),
+    )
+    assert same(watched.search(state)[0], watched.search(forgot)[0]._replace(model=state.model))
+    assert not same(watched.fit(state)[0].model.params, watched.fit(forgot)[0].model.params)
+    other = compose(tiny(**QUICK, fit__reset=True, search__reset=False), watched.exp.task)
+    fit, search = jax.jit(other.fit), jax.jit(other.search)
+    assert same(fit(state)[0].model, fit(forgot)[0].model)
+    assert not same(search(state)[0].policy.params, search(forgot)[0].policy.params)
+
+
+def test_a_bad_model_leaves_the_policy_as_it_is_and_is_counted(watched, looped):
+    """A model of NaN: every imagined gradient is bad, the run goes on."""
+    state = looped[0][1]
+    poisoned = state._replace(
+        model=state.model._replace(params=jax.tree.map(lambda p: p * jnp.nan, state.model.params))
+    )
+    after, info = watched.search(poisoned)
+    assert same(after.policy.params, state.policy.params)
+    assert info.skipped == 6
+
+
+def test_imagination_is_fresh_and_of_the_state(watched, looped):
+    imagine = jax.jit(watched.exp.imagine)
+    imagined, costs = imagine(looped[0][3])
+    assert imagined.x.shape == (9, 5, 2)
+    np.testing.assert_allclose(costs[2, 3], watched.exp.task.cost(imagined.seen[2, 3]), rtol=1e-5)
+    again, _ = imagine(looped[0][3])
+    other, _ = imagine(looped[0][2])
+    assert same(imagined, again)
+    assert not np.any(np.isclose(imagined.x[0], other.x[0]))  # other start particles in another trial
+
+
+def test_no_two_purposes_trials_or_iterations_share_a_key():
+    """Every key that reaches a piece in two whole trials is seen once.
+
+    All periods are 1, so that each draw is used; `fold_in(key, i)` and `split(key)[i]` are the same key in JAX, which
+    is how purposes that look apart could meet.
+    """
+    seen = []
+
+    def note(key):
+        jax.debug.callback(lambda data: seen.append(data.tobytes()), jax.random.key_data(key))
+
+    def noted(function, position=0):
+        def wrapped(*arguments):
+            note(arguments[position])
+            return function(*arguments)
+
+        return wrapped
+
+    task = cart(horizon=3)
+    config = tiny(**{**QUICK, "fit__steps": 4, "search__steps": 3}, search__period=Period(1, 1, 1, 1, 1))
+    dynamics, policy = dynamics_of(config.model, task), policy_of(config.policy, task)
+    exp = compose(
+        config,
+        task._replace(plant=task.plant._replace(reset=noted(task.plant.reset))),
+        dynamics._replace(init=noted(dynamics.init), loss=noted(dynamics.loss, 1), sample=noted(dynamics.sample)),
+        policy._replace(init=noted(policy.init), sample=noted(policy.sample)),
+    )
+    unchecked(jax.jit(run(exp, 2, 3)))(jax.random.key(0))
+    jax.effects_barrier()
+    searched = 2 * (3 + 1) * 2 * 5  # trials, iterations and the one after, model and policy, particles
+    episodes = 2 * (1 + 3) * (1 + 3)  # trials, collected and evaluated, a reset and the policy's draws
+    assert len(seen) == 2 + 2 * 4 + searched + episodes
+    assert len(set(seen)) == len(seen)
+
+
+def test_purposes_have_names_and_numbers_apart():
+    purposes = [COLLECT, FIT, SEARCH, IMAGINE, EVALUATE]
+    root = jax.random.key(0)
+    keys = {jax.random.key_data(trial_key(root, t, p)).tobytes() for t in range(1, 40) for p in purposes}
+    assert len(keys) == 39 * 5
+    assert jax.random.key_data(root).tobytes() not in keys
+
+
+# Probes: the whole loop learns in seconds
+
+
+@pytest.mark.parametrize("task", [cart, dial])
+def test_the_loop_learns_a_probe(task):
+    """From random controls to a good policy; the dial can only be learned through the seam at 180 degrees."""
+    exp = compose(tiny(), task())
+    _, info = unchecked(jax.jit(run(exp, 4, 20)))(jax.random.key(1))
+    last = info.evaluation[-1]
+    assert np.mean(last) < 0.7 * np.mean(info.trajectory.cost[0])  # random controls
+    assert np.mean(last[:, -2:]) < 0.35
+    assert np.all(np.isfinite(info.fit.loss))
+    assert np.all(info.fit.skipped + info.search.skipped == 0)
+    np.testing.assert_allclose(info.search.objective[-1, -1], np.mean(last), atol=0.15)  # imagination is about right
+
+
+def test_a_run_longer_than_its_data_set_is_refused():
+    """Capacity is that of config.trials; one more episode would overwrite the last one's rows, silently."""
+    exp = compose(tiny(**QUICK), cart())
+    with pytest.raises(ValueError, match="trials"):
+        unchecked(jax.eval_shape)(run(exp, TRIALS + 1, 1), jax.random.key(0))
