@@ -1,0 +1,61 @@
+"""A feedback law for the swimmer: a person's idea of the manoeuvres, its gains found by search.
+
+It sees only the observation. Point the nose ahead, up or down as the depth's error asks; turn the roll angle, or its
+rate, to its aim by opposite offsets of the left and right flippers; pitch by common (two legs) or front against rear
+offsets (six); yaw by different amplitudes; six legs also push straight down or up by offsets of all of them.
+"""
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+ROLL = {"knife_edge": np.pi / 2, "belly_up": np.pi, "depth_change": 0.0, "corkscrew": None}
+NAMES = ("thrust", "roll", "roll_rate", "pitch", "pitch_rate", "yaw", "yaw_rate", "depth", "steady", "lead", "heave")
+GAINS = {
+    (2, "knife_edge"): [0.675, 0.401, 0.024, 0.43, 0.02, 0.173, 0.11, 0.424, 0.414, 0.465, 0.0],
+    (2, "belly_up"): [0.781, 0.34, 0.038, 0.348, 0.19, 0.182, 0.058, 0.572, 0.244, 0.164, 0.0],
+    (2, "corkscrew"): [0.597, 0.208, 0.027, 0.632, 0.126, 0.09, 0.098, 0.456, 0.868, 1.021, 0.0],
+    (2, "depth_change"): [0.768, 0.066, -0.015, 0.987, -0.165, 0.227, 0.127, 0.526, 0.228, 0.881, 0.0],
+    (6, "knife_edge"): [0.699, 0.514, -0.015, 0.333, 0.024, 0.359, 0.046, 0.367, 0.673, 1.929, 0.0],
+    (6, "belly_up"): [0.774, 0.362, 0.012, 0.529, 0.04, 0.236, 0.074, 0.584, 0.648, -0.012, 0.0],
+    (6, "corkscrew"): [0.509, 0.106, 0.02, 0.427, 0.006, 0.327, 0.141, 0.677, 0.494, 0.217, 0.0],
+    (6, "depth_change"): [0.776, 0.201, 0.005, 0.81, -0.037, 0.218, 0.2, 0.613, 0.357, 1.027, 0.0],
+}
+"""By a cross-entropy search over 32 candidates, 9 generations, 2 starts each"""
+
+
+def feedback(gains: Array, x: Array, task: str, legs: int, depth: float, rate: float = -2.0 * np.pi / 3.0) -> Array:
+    """x [7 or 13] -> control [4 or 18]."""
+    thrust, k_roll, k_roll_rate, k_pitch, k_pitch_rate, k_yaw, k_yaw_rate, k_depth, steady, lead, k_heave = gains
+    spin, pitch_rate, yaw_rate = x[4:7]
+    dive = jnp.clip(k_depth * (depth - x[3]), -1.2, 1.2)
+    ahead = jnp.stack([jnp.cos(dive), 0.0, -jnp.sin(dive)])
+    side, up = _in_body(x[:3], ahead)[1:]
+    turn = lead * spin  # the body will have rolled on when the command acts
+    side, up = side * jnp.cos(turn) + up * jnp.sin(turn), up * jnp.cos(turn) - side * jnp.sin(turn)
+    if ROLL[task] is None:
+        roll = steady * rate / (2.0 * np.pi / 3.0) + k_roll * (rate - spin)
+    else:
+        # Always the same way over, for a belly-up: the shorter way would change with the noise.
+        error = (ROLL[task] - x[0] + np.pi - 1.0) % (2.0 * np.pi) - np.pi + 1.0
+        roll = k_roll * error - k_roll_rate * spin
+    pitch = -k_pitch * up - k_pitch_rate * pitch_rate
+    yaw = k_yaw * side - k_yaw_rate * yaw_rate
+    left, right = thrust - yaw, thrust + yaw
+    if legs == 2:
+        return jnp.stack([left, right, pitch + roll, pitch - roll])
+    heave = jnp.clip(k_heave * (depth - x[3]), -1.0, 1.0) * jnp.cos(x[0])
+    amplitude = jnp.stack([left, left, left, right, right, right])
+    along = jnp.array([-1.0, 0.0, 1.0, -1.0, 0.0, 1.0])
+    across = jnp.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
+    return jnp.concatenate([amplitude, pitch * along + roll * across - heave, jnp.array([0.0, np.pi, 0.0] * 2)])
+
+
+def _in_body(angles: Array, vector: Array) -> Array:
+    """A vector of the world [3] in the frame of a body at roll, pitch, yaw [rad]."""
+    roll, pitch, yaw = angles
+    x, y, z = vector
+    x, y = x * jnp.cos(yaw) + y * jnp.sin(yaw), y * jnp.cos(yaw) - x * jnp.sin(yaw)
+    x, z = x * jnp.cos(pitch) - z * jnp.sin(pitch), z * jnp.cos(pitch) + x * jnp.sin(pitch)
+    y, z = y * jnp.cos(roll) + z * jnp.sin(roll), z * jnp.cos(roll) - y * jnp.sin(roll)
+    return jnp.stack([x, y, z])
