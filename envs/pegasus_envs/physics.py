@@ -10,7 +10,9 @@ needs. The physics is MJX's own, and tests hold it to `mjx.step` and to C MuJoCo
 # (MuJoCo's bindings and MJX's data classes declare few of their names.)
 
 import copy
+import io
 from collections.abc import Iterable
+from contextlib import redirect_stdout
 from functools import cache
 from operator import attrgetter
 from pathlib import Path
@@ -21,7 +23,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-from mujoco import mjx
+
+with redirect_stdout(io.StringIO()):  # on import MJX prints that warp, which we do not use, is not installed
+    from mujoco import mjx
 
 from pegasus_envs.fluid import passive_force
 
