@@ -91,7 +91,9 @@ def dynamics_of(config: settings.BNN, task: Task) -> Dynamics:
         head=HEADS[config.head],
         heteroscedastic=config.heteroscedastic,
         full_whitening=config.whitening == "full",
+        kl_weight=config.kl_weight,
         weight_decay=config.weight_decay,
+        activation=config.activation,
         initialiser=config.initialiser,
     )
 

@@ -51,6 +51,7 @@ def setting(default: Any, text: str) -> Any:
 
 DROPOUTS = ("log_normal", "binary", "concrete", "gaussian", "sparse", "none")
 HEADS = ("sigmoid", "softplus")
+ACTIVATIONS = ("relu", "silu", "tanh")
 INITIALISERS = ("glorot", "orthogonal")
 SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
@@ -71,11 +72,15 @@ class BNN:
     heteroscedastic: bool = setting(True, "predicted noise depends on the input")
     head: str = setting("sigmoid", "form of the predicted noise: sigmoid (at most .1 of the target's scale), softplus")
     whitening: str = setting("full", "scaling of inputs and targets: full covariance, or diagonal")
+    kl_weight: float = setting(1.0, "factor of the noise's KL divergence; 1 is the variational bound")
     weight_decay: float = setting(1.0, "factor of the Gaussian prior on the weights")
+    activation: str = setting("relu", "nonlinearity: relu, silu, tanh")
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hidden", _layers("model.hidden", self.hidden))
+        _choice("model.activation", self.activation, ACTIVATIONS)
+        _within("model.kl_weight", self.kl_weight, 0)
         _choice("model.dropout", self.dropout, DROPOUTS)
         _choice("model.head", self.head, HEADS)
         _choice("model.whitening", self.whitening, ("full", "diagonal"))

@@ -1,4 +1,4 @@
-"""The one network: a ReLU multilayer perceptron whose noise is an argument."""
+"""The one network: a multilayer perceptron whose noise is an argument."""
 
 from collections.abc import Callable, Sequence
 
@@ -13,16 +13,20 @@ INITIALISERS: dict[str, Callable] = {
 }
 
 
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "silu": nn.silu, "tanh": nn.tanh}
+
+
 def _small_uniform(key: jax.Array, shape: Sequence[int], dtype: object = None) -> Array:
     return jax.random.uniform(key, shape, minval=-0.01, maxval=0.01)  # as the authors' (reference settings 4.1)
 
 
 class MLP(nn.Module):
-    """Dense layers with ReLU between them; layer i sees its input times masks[i] (None: as it is)."""
+    """Dense layers with a nonlinearity between them; layer i sees its input times masks[i] (None: as it is)."""
 
     hidden: tuple[int, ...]
     outputs: int
     initialiser: str = "glorot"
+    activation: str = "relu"
 
     @nn.compact
     def __call__(self, x: Array, masks: Sequence[Array | None]) -> Array:
@@ -33,5 +37,5 @@ class MLP(nn.Module):
             x = x if mask is None else x * mask
             x = nn.Dense(width, kernel_init=kernel_init, bias_init=_small_uniform, name=f"layer_{i}")(x)
             if i < len(self.hidden):
-                x = nn.relu(x)
+                x = ACTIVATIONS[self.activation](x)
         return x

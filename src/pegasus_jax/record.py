@@ -13,12 +13,16 @@ Files appear whole or not at all: written beside their place, flushed to disk, t
 
 import json
 import os
+import platform
+import sys
 import tempfile
 import zipfile
 from collections.abc import Callable
+from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
 
+import jax
 import numpy as np
 from filelock import FileLock, Timeout
 
@@ -147,6 +151,24 @@ def write_trials(run: Path, rows: list[dict[str, Any]]) -> None:
     """Replace trials.jsonl by these rows."""
     text = "".join(json.dumps(row) + "\n" for row in rows)
     write_whole(run / "trials.jsonl", lambda file: file.write(text.encode()))
+
+
+def about(command: str) -> dict[str, Any]:
+    """Versions, machine and command: what somebody else needs to repeat the run."""
+    packages = ("pegasus-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+    versions = {}
+    for name in packages:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return {
+        "command": command,
+        "python": sys.version.split()[0],
+        "platform": platform.platform(),
+        "devices": [str(device) for device in jax.devices()],
+        "versions": versions,
+    }
 
 
 def _readable(path: Path) -> Any:

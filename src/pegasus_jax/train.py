@@ -1,11 +1,8 @@
 """The main job: run an experiment trial by trial on this machine, leaving a run's folder that survives anything."""
 
-import platform
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +86,7 @@ def train(config: Config, run: Path, *, resume: bool = False, command: str = "")
         before = settings.load(run / "config.yaml") if resume else config
         if config.trials < before.trials:
             raise SettingError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
-        record.write_json(run / "run.json", about(command))
+        record.write_json(run / "run.json", record.about(command))
         experiment = build(config)
         program = Program(experiment, config.search.steps)
         state = program("init", jax.random.key(config.seed))
@@ -221,21 +218,3 @@ def summary(row: dict[str, Any], trials: int) -> str:
         f"  ({seconds:.0f} s, {row['seconds']['compile']:.0f} s of it compiling)"
         + (f"  {row['skipped_updates']} updates skipped" if row["skipped_updates"] else "")
     )
-
-
-def about(command: str) -> dict[str, Any]:
-    """Versions, machine and command: what somebody else needs to repeat the run."""
-    packages = ("pegasus-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
-    versions = {}
-    for name in packages:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
-    return {
-        "command": command,
-        "python": sys.version.split()[0],
-        "platform": platform.platform(),
-        "devices": [str(device) for device in jax.devices()],
-        "versions": versions,
-    }

@@ -1,4 +1,4 @@
-"""Bayesian neural network dynamics: a ReLU network with multiplicative noise on its units (paper, section IV-C)."""
+"""Bayesian neural network dynamics: a network with multiplicative noise on its units (paper, section IV-C)."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -47,17 +47,19 @@ def bnn(
     head: Head,
     heteroscedastic: bool,
     full_whitening: bool,
-    weight_decay: float,
-    initialiser: str,
+    kl_weight: float = 1.0,
+    weight_decay: float = 1.0,
+    activation: str = "relu",
+    initialiser: str = "glorot",
 ) -> Dynamics:
     """A BNN over (encoded state, control) -> change of state [D], with its noise std [D].
 
     Layer i multiplies its input by noise of `dropout`; the network's own inputs carry `input_dropout`, or none. With
-    `heteroscedastic` the noise std is a function of the input, otherwise one vector of parameters. `weight_decay`
-    scales the Gaussian weight prior (reference settings 4.4).
+    `heteroscedastic` the noise std is a function of the input, otherwise one vector of parameters. `kl_weight`
+    and `weight_decay` scale the KL of the noise and the Gaussian weight prior (reference settings 4.4).
     """
     features = states + len(angles) + controls
-    network = MLP(hidden, states * (2 if heteroscedastic else 1), initialiser)
+    network = MLP(hidden, states * (2 if heteroscedastic else 1), initialiser, activation)
     kinds = (input_dropout, *(dropout for _ in hidden))
     widths = (features, *hidden)
 
@@ -107,7 +109,7 @@ def bnn(
             layer = params["network"]["params"][f"layer_{i}"]
             retained = kind.decay(noise) if kind else jnp.ones(widths[i])
             prior += 0.5 * jnp.sum(retained * jnp.sum(layer["kernel"] ** 2, 1)) + 0.5 * jnp.sum(layer["bias"] ** 2)
-        return kl + weight_decay * prior
+        return kl_weight * kl + weight_decay * prior
 
     def sample(key: Key, belief: Belief) -> list[Array | None]:
         """The masks of one particle, w^(k) = g_2(w, z_w^(k)) (Alg. 3 line 9): all that differs between particles."""

@@ -1,0 +1,1 @@
+"""Measurements: speed (suite), learning (study, figures), pictures for the documentation."""

@@ -1,0 +1,215 @@
+"""Runs as a user makes them: real processes, killed at any moment, resumed, damaged, contended for."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pegasus_jax import record
+
+# A run of seconds: the smallest networks and searches that still go through every part.
+TINY = ["task=cartpole", "trials=3", "model.hidden=[16]", "policy.hidden=[8]", "fit.steps=20", "search.steps=20"]
+TINY += ["search.particles=10"]
+
+
+def program(name: str) -> list[str]:
+    """The installed console script, run by this interpreter."""
+    return [sys.executable, "-c", f"from pegasus_jax.cli import {name}; {name}()"]
+
+
+def call(name: str, *words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*program(name), *map(str, words)], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+def fingerprint(run: Path) -> str:
+    done = call("evaluate", run, "episodes=1", "json=true", cwd=run.parent)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout)["fingerprint"]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An uninterrupted run."""
+    run = tmp_path_factory.mktemp("runs") / "whole"
+    done = call("train", *TINY, f"out={run}", cwd=run.parent)
+    assert done.returncode == 0, done.stderr
+    return run
+
+
+def copy_until(whole: Path, run: Path, trial: int) -> Path:
+    """A run as a kill would leave it after `trial`: what comes later is not there."""
+    run.mkdir()
+    for path in sorted(whole.rglob("*")):
+        number = next((int(p[:4]) for p in path.relative_to(whole).parts if p[:4].isdecimal()), 0)
+        if path.is_file() and number <= trial and path.name != ".lock":
+            target = run / path.relative_to(whole)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(path.read_bytes())
+    return run
+
+
+def test_a_run_leaves_everything(whole: Path) -> None:
+    rows = record.trials(whole)
+    assert [row["trial"] for row in rows] == [1, 2, 3]
+    assert [row["plant_seconds"] for row in rows] == [2.5, 5.0, 7.5]
+    assert [row["random"] for row in rows] == [True, False, False]
+    for row in rows:
+        assert {"collect", "fit", "search", "compile"} <= row["seconds"].keys()
+        assert 0 <= row["mean_cost"] <= 1
+        assert 0 <= row["success_rate"] <= 1
+        for name in ("fit_loss", "objective_first", "objective_last", "objective_fresh", "gradient_norm"):
+            assert np.isfinite(row[name]), name
+        assert row["skipped_updates"] == 0
+    assert sum(row["seconds"]["compile"] for row in rows[1:]) == 0  # nothing recompiles from trial to trial
+    assert list((whole / "tensorboard").glob("events*"))
+    about = json.loads((whole / "run.json").read_text())
+    assert "task=cartpole" in about["command"]
+    assert "jax" in about["versions"]
+
+
+def test_episodes_can_be_read_without_us(whole: Path) -> None:
+    with np.load(whole / "episodes" / "0002.npz") as file:
+        assert file["x"].shape == (26, 4)
+        assert file["u"].shape == (25, 1)
+        assert file["cost"].shape == (25,)
+        assert list(file["control_names"])
+        assert len(file["state_names"]) == 4
+        assert float(file["dt"]) == pytest.approx(0.1)
+        assert np.all(np.abs(file["u"]) <= 10)
+
+
+@pytest.mark.parametrize("moment", ["first episode", "second episode", "second imagined", "third episode"])
+def test_killed_and_resumed_is_bit_equal(whole: Path, tmp_path: Path, moment: str) -> None:
+    """kill -9 as soon as a certain file appears, at several points of a trial."""
+    run = tmp_path / "killed"
+    awaited = {
+        "first episode": run / "episodes" / "0001.npz",  # durable, but nothing has been learned from it
+        "second episode": run / "episodes" / "0002.npz",
+        "second imagined": run / "imagined" / "0002.npz",  # before that trial's row and checkpoint
+        "third episode": run / "episodes" / "0003.npz",
+    }[moment]
+    process = subprocess.Popen([*program("train"), *TINY, f"out={run}"], cwd=tmp_path, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not awaited.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.002)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert awaited.exists()
+    kept = awaited.read_bytes()
+    done = call("train", f"resume={run}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert awaited.read_bytes() == kept or "imagined" in str(
+        awaited
+    )  # an episode once collected is never collected again
+    assert fingerprint(run) == fingerprint(whole)
+    assert [row["trial"] for row in record.trials(run)] == [1, 2, 3]
+
+
+def test_an_episode_on_disk_takes_the_place_of_the_plant(whole: Path, tmp_path: Path) -> None:
+    """After a crash the episode that was run is used, though the plant could not repeat it."""
+    run = copy_until(whole, tmp_path / "run", 1)
+    other = record.load_episode(whole, 3)
+    assert other is not None
+    np.savez(run / "episodes" / "0002.npz", **other._asdict())
+    assert call("train", f"resume={run}", cwd=tmp_path).returncode == 0
+    used = record.load_episode(run, 2)
+    assert used is not None
+    np.testing.assert_array_equal(used.x, other.x)
+    assert fingerprint(run) != fingerprint(whole)
+
+
+def test_a_damaged_checkpoint_is_named_and_the_one_before_used(whole: Path, tmp_path: Path) -> None:
+    run = copy_until(whole, tmp_path / "run", 2)
+    victim = max((run / "checkpoints" / "0002").rglob("*"), key=lambda p: p.stat().st_size if p.is_file() else -1)
+    victim.write_bytes(victim.read_bytes()[:-10])
+    done = call("train", f"resume={run}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert victim.name in done.stderr
+    assert "checkpoint 2 is not usable" in done.stderr
+    assert fingerprint(run) == fingerprint(whole)
+
+
+def test_all_checkpoints_damaged_starts_from_the_episodes(whole: Path, tmp_path: Path) -> None:
+    run = copy_until(whole, tmp_path / "run", 2)
+    for sums in (run / "checkpoints").glob("*.json"):
+        sums.unlink()
+    assert call("train", f"resume={run}", cwd=tmp_path).returncode == 0
+    assert fingerprint(run) == fingerprint(whole)
+
+
+def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:
+    run = copy_until(whole, tmp_path / "run", 9)
+    done = call("train", f"resume={run}", "trials=4", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert [row["trial"] for row in record.trials(run)] == [1, 2, 3, 4]
+    fewer = call("train", f"resume={run}", "trials=2", cwd=tmp_path)
+    assert fewer.returncode == 2
+    assert "at least 4" in fewer.stderr
+
+
+def test_two_processes_cannot_write_to_one_run(whole: Path, tmp_path: Path) -> None:
+    run = copy_until(whole, tmp_path / "run", 9)
+    with record.lock(run):
+        done = call("train", f"resume={run}", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "another process" in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_eval_and_plot_work_while_a_run_goes_on(whole: Path, tmp_path: Path) -> None:
+    run = copy_until(whole, tmp_path / "run", 2)
+    with record.lock(run):
+        evaluated = call("evaluate", run, "episodes=2", "json=true", cwd=tmp_path)
+        plotted = call("plot", run, cwd=tmp_path)
+    assert json.loads(evaluated.stdout)["trial"] == 2
+    assert plotted.returncode == 0, plotted.stderr
+    drawn = {Path(line).name for line in plotted.stdout.split()}
+    assert {"learning.png", "trial_0001.png", "trial_0002.png"} <= drawn
+    assert all((run / "plots" / name).read_bytes().startswith(b"\x89PNG") for name in drawn)
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "message"),
+    [
+        ("train", ["task=cartpol"], "did you mean 'cartpole'"),
+        ("train", ["task=cartpole", "serch.steps=3"], "did you mean 'search.steps'"),
+        ("train", ["task=cartpole", "search.steps=many"], "a whole number"),
+        ("train", ["task=cartpole", "policy.dropout=1.5"], "the nearest is 0.99"),
+        ("train", ["task=cartpole", "search.particles=4"], "at least 5"),
+        ("train", ["task=cartpole", "out=/proc/nowhere"], "out=/proc/nowhere cannot be written"),
+        ("train", ["resume=nowhere"], "nowhere is not a run"),
+        ("train", ["resume=nowhere", "seed=3"], "seed cannot be changed"),
+        ("evaluate", ["nowhere"], "nowhere is not a run"),
+        ("evaluate", ["nowhere", "episode=3"], "did you mean 'episodes'"),
+        ("plot", [], "name one run"),
+    ],
+)
+def test_bad_input_is_one_clear_line(name: str, words: list[str], message: str, tmp_path: Path) -> None:
+    if not words:
+        words = ["a", "b"]
+    done = call(name, *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())  # nothing was written
+
+
+def test_a_folder_that_holds_a_run_is_not_overwritten(whole: Path) -> None:
+    done = call("train", *TINY, f"out={whole}", cwd=whole.parent)
+    assert done.returncode == 2
+    assert f"resume={whole}" in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("name", "words"), [("train", "search.period.dynamics"), ("evaluate", "episodes"), ("plot", "RUN")]
+)
+def test_help_is_there(name: str, words: str, tmp_path: Path) -> None:
+    done = call(name, "--help", cwd=tmp_path)
+    assert done.returncode == 0
+    assert words in done.stdout
