@@ -18,3 +18,11 @@ def x64():
     """Float64 inside one test, for closed forms and finite differences."""
     with jax.enable_x64(True):
         yield
+
+
+@pytest.fixture(scope="module")
+def quick_compile():
+    """Compile faster to slower code: for modules whose programs are many and tiny."""
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", False)

@@ -174,6 +174,38 @@ def linear_policy(states: int, controls: int) -> Policy:
     )
 
 
+def regression(states: int, controls: int) -> Dynamics:
+    """A random linear model, fitted by noisy least squares: everything a model has, and it compiles in no time."""
+    shape = (states + controls, states)
+
+    def loss(params, key, batch, context):
+        noise = 1 + 0.1 * jax.random.normal(key, shape)
+        return context * jnp.mean((batch.y - jnp.concatenate([batch.x, batch.u], -1) @ (params * noise)) ** 2)
+
+    return Dynamics(
+        init=lambda key: jax.random.normal(key, shape),
+        prepare=lambda data: 1 + 0 * jnp.mean(data.y),
+        loss=loss,
+        condition=lambda params, data: params,
+        sample=lambda key, belief: belief * (1 + 0.1 * jax.random.normal(key, shape)),
+        apply=lambda belief, draw, x, u: Prediction(jnp.concatenate([x, u]) @ draw, 0.05 + 0 * x),
+    )
+
+
+def noisy_linear_policy(task: Task) -> Policy:
+    """u = limit tanh(gain x + noise), for symmetric limits."""
+    limit, shape = jnp.asarray(task.control_high, jnp.float32), (len(task.control_names), len(task.state_names))
+
+    def apply(gain, noise, x):
+        return limit * jnp.tanh(gain @ x + (0 if noise is None else noise))
+
+    return Policy(
+        init=lambda key: jax.random.normal(key, shape),
+        sample=lambda key: 0.1 * jax.random.normal(key, shape[:1]),
+        apply=apply,
+    )
+
+
 def balanced_start(plant: Linear, particles: int) -> Any:
     """(key, belief) -> first states [K, D] with exactly the plant's mean and covariance."""
 

@@ -15,6 +15,8 @@ from pegasus_jax.fit import fit, guarded
 from pegasus_jax.types import Batch, Dataset, Learner
 from probes import experience, network
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 BATCH = Batch(*(rows[:6] for rows in experience()[:3]))
 
 
@@ -34,9 +36,10 @@ def log_normal_kl(params):
     return float(np.log(10) * len(mu) - np.sum(entropies))
 
 
-@pytest.mark.parametrize("heteroscedastic", [True, False])
-@pytest.mark.parametrize("kind", ["none", "log_normal"])
-@pytest.mark.parametrize("full", [True, False])
+@pytest.mark.parametrize(
+    ("kind", "heteroscedastic", "full"),
+    [("none", True, True), ("none", False, False), ("log_normal", True, True)],
+)
 def test_the_loss_is_eq_2_over_n(kind, heteroscedastic, full):
     """-log likelihood a row without its 2 pi, plus KL and half the squared weights, over the rows of the data set.
 
@@ -89,7 +92,7 @@ def test_binary_dropout_thins_the_weight_prior_of_the_layers_it_acts_on():
 def test_every_row_of_a_batch_has_noise_of_its_own():
     """Kingma's local noise: a batch of one row repeated has as many losses as it has rows."""
     model, data = network("binary"), experience()
-    params = model.init(jax.random.key(0))
+    params = jax.jit(model.init)(jax.random.key(0))
     one = Batch(*(rows[:1] for rows in BATCH))
     many = Batch(*(jnp.repeat(rows, 400, 0) for rows in one))
     loss = jax.jit(model.loss)
@@ -100,7 +103,7 @@ def test_every_row_of_a_batch_has_noise_of_its_own():
     np.testing.assert_allclose(batches.mean(), single.mean(), atol=5 * single.std() / np.sqrt(60))
 
 
-@pytest.mark.parametrize("kind", ["log_normal", "binary", "concrete", "gaussian", "sparse", "none"])
+@pytest.mark.parametrize("kind", ["log_normal", "binary", "none"])
 def test_a_draw_is_one_deterministic_function_and_draws_differ(kind):
     model = network(kind)
     belief = jax.jit(lambda key, data: model.condition(model.init(key), data))(jax.random.key(0), experience())
@@ -116,7 +119,7 @@ def test_a_draw_is_one_deterministic_function_and_draws_differ(kind):
 
 def test_input_noise_masks_the_inputs_too():
     model = network("binary", input_dropout=dropout.binary(0.5))
-    belief = model.condition(model.init(jax.random.key(0)), experience())
+    belief = model.condition(jax.jit(model.init)(jax.random.key(0)), experience())
     draw = model.sample(jax.random.key(1), belief)
     assert draw[0].shape == (6,)
     silent = [jnp.zeros(6), jnp.ones(8)]
@@ -129,7 +132,7 @@ def test_input_noise_masks_the_inputs_too():
 
 def test_angles_enter_by_sine_and_cosine():
     model = network()
-    belief = model.condition(model.init(jax.random.key(0)), experience())
+    belief = model.condition(jax.jit(model.init)(jax.random.key(0)), experience())
     draw = model.sample(jax.random.key(1), belief)
     x, u = BATCH.x[0], BATCH.u[0]
     here, there = (model.apply(belief, draw, x.at[2].add(turn), u).mean for turn in (0.0, 2 * np.pi))

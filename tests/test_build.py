@@ -18,6 +18,8 @@ from pegasus_jax.search import objective
 from pegasus_jax.trial import SEARCH, trial_key
 from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, tiny
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 
 def test_the_choices_of_a_config_are_the_pieces_there_are():
     """config.py cannot import the pieces; it lists their names, and this keeps the lists true."""
@@ -105,12 +107,22 @@ def test_too_few_particles_for_a_covariance_are_refused(search, part):
 # What reaches the search, seen on pieces that compile in no time: a linear model, noisy, and a linear policy
 
 
+def eagerly(function):
+    """Operation by operation: for one step of a tiny search, nine times faster than compiling it."""
+
+    def call(*arguments):
+        with jax.disable_jit():
+            return function(*arguments)
+
+    return call
+
+
 def searcher(**search):
     """A state with a gain that is not zero, and a one-step search from it."""
     chosen = dataclasses.replace(tiny(), search=config.Search(**{"steps": 1, "particles": 5, **search}))
     policy = linear_policy(2, 1)._replace(init=lambda key: jnp.array([[-0.5, -0.8]]))
-    exp = compose(chosen, cart(horizon=4), dynamics=known(PENDULUM, noise_std=0.2), policy=policy)
-    return exp, exp.init(jax.random.key(0)), jax.jit(exp.search)
+    exp = compose(chosen, cart(horizon=2), dynamics=known(PENDULUM, noise_std=0.2), policy=policy)
+    return exp, exp.init(jax.random.key(0)), eagerly(exp.search)
 
 
 def first_objective(**search):
@@ -123,8 +135,8 @@ def test_settings_of_the_search_reach_the_objective():
     changes = dict(match=False, balanced=True, discount=0.5, aggregate="total")
     changes |= dict(policy_noise=0.0, state_noise=1.0, cost_noise=1.0)
     values = {name: first_objective(**{name: value}) for name, value in changes.items()}
-    np.testing.assert_allclose(values.pop("aggregate"), 4 * plain, rtol=1e-4)  # the sum over 4 steps
-    assert values["discount"] < 0.7 * plain
+    np.testing.assert_allclose(values.pop("aggregate"), 2 * plain, rtol=1e-4)  # the sum over 2 steps
+    assert values["discount"] < 0.9 * plain
     assert all(abs(value - plain) > 1e-6 for value in values.values()), values
     assert len(set(values.values())) == len(values)
 
@@ -150,7 +162,7 @@ def test_the_search_minimises_what_objective_says():
     exp, state, run = searcher()
     pieces = dict(dynamics=exp.dynamics, policy=exp.policy)
     of_task = partial(start, task=exp.task)
-    blocks = scenarios.blocks(**pieces, start=of_task, particles=5, horizon=4, balanced=False)
+    blocks = scenarios.blocks(**pieces, start=of_task, particles=5, horizon=2, balanced=False)
     given = scenarios.draw(trial_key(state.key, 0, SEARCH), 0, None, blocks=blocks, period=types.Period())
     of_particles = cost.of_particles(exp.task.cost)
     by_hand = objective(state.policy.params, None, given, **pieces, match=moments.match, cost=of_particles)

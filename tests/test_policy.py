@@ -12,6 +12,8 @@ from pegasus_jax import dropout
 from pegasus_jax.policy.squash import SQUASHES, sine, to_limits
 from probes import LIMITS, controller
 
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
 every_squash = pytest.mark.parametrize("squash", SQUASHES)
 single = st.floats(-1e6, 1e6, width=32)
 
@@ -39,13 +41,16 @@ def test_controls_are_within_limits_for_any_state(squash, outputs, seed, x):
     assert np.all(u <= LIMITS[1])
 
 
+SATURATE = {name: jax.jit(lambda low, high, v, f=f: to_limits(f, low, high)(v)) for name, f in SQUASHES.items()}
+
+
 @every_squash
 @given(arrays(np.float32, 2, elements=st.floats(-100, 100, width=32)), st.integers(0, 2**16))
 def test_saturation_never_leaves_the_limits_by_a_single_bit(squash, ends, seed):
     """A Gymnasium box refuses a control that is one rounding outside, and so may a motor driver."""
     low, high = np.sort(ends)
     v = np.random.default_rng(seed).normal(size=64).astype(np.float32) * 10
-    u = np.asarray(to_limits(SQUASHES[squash], jnp.float32(low), jnp.float32(high))(jnp.asarray(v)))
+    u = np.asarray(SATURATE[squash](low, high, v))
     assert np.all(u >= low)
     assert np.all(u <= high)
 
@@ -69,7 +74,7 @@ def test_the_sine_saturation_is_pilcos():
 def test_the_mean_policy_is_the_network_with_every_unit_at_its_expected_size():
     """Against NumPy, with the masks of binary dropout and with their mean."""
     policy = controller(dropout.binary(0.3))
-    params = policy.init(jax.random.key(0))
+    params = jax.jit(policy.init)(jax.random.key(0))
     noise = policy.sample(jax.random.key(1))
     x = np.array([0.3, -0.7, 2.0], np.float32)
     layers = [jax.tree.map(np.asarray, params["network"]["params"][f"layer_{i}"]) for i in range(2)]
@@ -83,19 +88,19 @@ def test_the_mean_policy_is_the_network_with_every_unit_at_its_expected_size():
 
 def test_a_policy_without_noise_is_its_own_mean():
     policy = controller(dropout.none())
-    params, x = policy.init(jax.random.key(0)), jnp.array([0.3, -0.7, 2.0])
+    params, x = jax.jit(policy.init)(jax.random.key(0)), jnp.array([0.3, -0.7, 2.0])
     assert np.array_equal(policy.apply(params, policy.sample(jax.random.key(1)), x), policy.apply(params, None, x))
 
 
 def test_a_mask_is_a_draw_and_the_control_a_function_of_it():
     """The same draw gives the same control; other draws drop other units, each at the given rate."""
     policy = controller(dropout.binary(0.3), hidden=(50, 50))
-    draws = jax.vmap(policy.sample)(jax.random.split(jax.random.key(0), 100))
+    draws = jax.jit(jax.vmap(policy.sample))(jax.random.split(jax.random.key(0), 100))
     assert [d.shape for d in draws] == [(100, 50)] * 2
     for layer in draws:
         np.testing.assert_allclose(np.mean(np.asarray(layer) < 0.7), 0.7, atol=0.03)
     assert not np.any(np.asarray(draws[0]) == np.asarray(draws[1]))  # layers are drawn apart
-    params, x = policy.init(jax.random.key(1)), jnp.array([0.3, -0.7, 2.0])
+    params, x = jax.jit(policy.init)(jax.random.key(1)), jnp.array([0.3, -0.7, 2.0])
     u = jax.vmap(policy.apply, (None, 0, None))(params, draws, x)
     assert len(np.unique(u, axis=0)) == 100
     np.testing.assert_allclose(policy.apply(params, [d[3] for d in draws], x), u[3], rtol=1e-5)
