@@ -100,9 +100,12 @@ def _compile(constructor: str, arguments: tuple[tuple[str, Any], ...]) -> _Compi
     module, _, name = constructor.partition(":")
     plant: Plant = getattr(import_module(module), name)(**dict(arguments))
 
-    def step(state: Any, control: jax.Array) -> tuple[Any, jax.Array, jax.Array]:
-        following = plant.step(state, control)
-        x = plant.observe(following)
-        return following, x, saturating(plant, x)
+    # Apart, so that plants with the same motion but other goals compile it once.
+    move, observe, cost = jax.jit(plant.step), jax.jit(plant.observe), jax.jit(lambda x: saturating(plant, x))
 
-    return _Compiled(plant, jax.jit(plant.place), jax.jit(step), jax.jit(plant.observe))
+    def step(state: Any, control: np.ndarray) -> tuple[Any, jax.Array, jax.Array]:
+        following = move(state, control)
+        x = observe(following)
+        return following, x, cost(x)
+
+    return _Compiled(plant, jax.jit(plant.place), step, observe)

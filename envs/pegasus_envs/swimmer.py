@@ -1,6 +1,9 @@
 """A six-legged swimmer, driven by periodic leg commands through its flippers: four manoeuvres, two or six legs."""
 
-from typing import Literal, NamedTuple
+import copy
+from collections.abc import Callable
+from functools import cache
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +12,7 @@ from jax import Array
 
 from pegasus_envs import physics
 from pegasus_envs.attitude import angles_of, quaternion_of
-from pegasus_envs.goals import Cost, Task, goal
+from pegasus_envs.goals import START_DEPTH, Cost, Task, goal
 from pegasus_envs.physics import Motion, Scalar
 from pegasus_envs.plant import Plant, draw_start
 
@@ -17,10 +20,13 @@ XML = "swimmer.xml"
 LEGS = ("FL", "ML", "RL", "FR", "MR", "RR")
 """front, middle, rear of the left side, then of the right: the order of every six-vector here"""
 REAR = (2, 5)
-HIPS, TIPS = slice(7, 19, 2), slice(8, 19, 2)
+HIPS = slice(7, 19, 2)
+"""in the positions"""
 AMPLITUDE, OFFSET, PHASE = np.pi / 4, np.pi / 3, np.pi
 LAG = 0.1
 """time constant of the filter on the commands [s]"""
+_PERIODS = {2: 1.0, 6: 0.5}
+"""control period for that many legs [s]"""
 
 
 class Swimming(NamedTuple):
@@ -68,11 +74,64 @@ def swimmer(
     A leg follows angle(t) = O + A sin(2 pi stroke_rate t + phase). The physical constants may be traced.
     """
     aim = goal(task, legs, cost, roll_rate)
-    system = physics.load(XML, _changes(hull_mass, hull_length, density, stiffness, aim.depth))
-    dt, horizon, dimensions = (1.0, 20, 7) if legs == 2 else (0.5, 40, 13)
+    body = _body(legs, float(stroke_rate), hull_mass, hull_length, density, stiffness)
+    model = copy.copy(body.model)
+    model.geom_pos[model.geom("goal").id, 2] = -aim.depth
     low, high = _limits(legs)
-    count, window = physics.substeps(system, dt), round(1.0 / stroke_rate / system.host.opt.timestep)
-    keep = np.exp(-system.host.opt.timestep / LAG)
+    dimensions = 7 if legs == 2 else 13
+    start_mean = np.zeros(dimensions)
+    start_mean[3] = START_DEPTH
+    start_std = np.where(np.arange(dimensions) < 7, 0.1, 0.0)
+    return Plant(
+        reset=lambda key: body.place(draw_start(key, start_mean, start_std)),
+        step=body.step,
+        observe=body.observe,
+        place=body.place,
+        error=aim.error,
+        width=aim.width,
+        control_low=low,
+        control_high=high,
+        dt=_PERIODS[legs],
+        horizon=round(20.0 / _PERIODS[legs]),
+        start_mean=start_mean,
+        start_std=start_std,
+        sensor_std=np.full(dimensions, 0.01),
+        angles=(0, 1, 2),
+        state_names=_state_names(dimensions),
+        control_names=_control_names(legs),
+        model=model,
+        qpos=lambda state: state.qpos,
+    )
+
+
+class _Body(NamedTuple):
+    """What the manoeuvres share."""
+
+    place: Callable[[Array], Swimming]
+    step: Callable[[Swimming, Array], Swimming]
+    observe: Callable[[Swimming], Array]
+    model: Any
+
+
+def _body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
+    """The same functions for the same constants: all manoeuvres then run one compiled program."""
+    if any(isinstance(constant, jax.Array) for constant in constants):
+        return _new_body(legs, stroke_rate, *constants)
+    return _known_body(legs, stroke_rate, bool(jax.config.jax_enable_x64), *constants)  # pyright: ignore
+
+
+@cache
+def _known_body(legs: int, stroke_rate: float, x64: bool, *constants: Scalar) -> _Body:
+    del x64  # part of the cache's key only
+    return _new_body(legs, stroke_rate, *constants)
+
+
+def _new_body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
+    system = physics.load(XML, _changes(*constants))
+    tick, dimensions = system.host.opt.timestep, 7 if legs == 2 else 13
+    low, high = _limits(legs)
+    count, window = physics.substeps(system, _PERIODS[legs]), round(1.0 / stroke_rate / tick)
+    keep = np.exp(-tick / LAG)
 
     def place(x: Array) -> Swimming:
         hips = x[7:] if legs == 6 else jnp.zeros(6, x.dtype)
@@ -89,7 +148,7 @@ def swimmer(
             motion, command, stroke = carry
             command = target + keep * (command - target)
             motion = physics.advance(system, motion, hip_angles(command, stroke))
-            stroke = stroke + stroke_rate * system.host.opt.timestep
+            stroke = stroke + stroke_rate * tick
             return (motion, command, stroke - jnp.floor(stroke)), motion.qvel[3:6]
 
         carry = Motion(state.qpos, state.qvel), state.command, state.stroke
@@ -100,29 +159,7 @@ def swimmer(
         depth, hips = -state.qpos[2:3], state.qpos[HIPS]
         return jnp.concatenate([angles_of(state.qpos[3:7]), depth, state.rate, hips])[:dimensions]
 
-    start_mean = np.zeros(dimensions)
-    start_mean[3] = 1.0
-    start_std = np.where(np.arange(dimensions) < 7, 0.1, 0.0)
-    return Plant(
-        reset=lambda key: place(draw_start(key, start_mean, start_std)),
-        step=step,
-        observe=observe,
-        place=place,
-        error=aim.error,
-        width=aim.width,
-        control_low=low,
-        control_high=high,
-        dt=dt,
-        horizon=horizon,
-        start_mean=start_mean,
-        start_std=start_std,
-        sensor_std=np.full(dimensions, 0.01),
-        angles=(0, 1, 2),
-        state_names=_state_names(dimensions),
-        control_names=_control_names(legs),
-        model=system.host,
-        qpos=lambda state: state.qpos,
-    )
+    return _Body(place, step, observe, system.host)
 
 
 def hip_angles(command: Array, stroke: Array) -> Array:
@@ -155,9 +192,7 @@ def _control_names(legs: int) -> tuple[str, ...]:
     return tuple(f"{leg} {kind} [rad]" for kind in kinds for leg in which)
 
 
-def _changes(
-    mass: Scalar, length: Scalar, density: Scalar, stiffness: Scalar, goal_depth: float
-) -> list[physics.Change]:
+def _changes(mass: Scalar, length: Scalar, density: Scalar, stiffness: Scalar) -> list[physics.Change]:
     """What the constants determine in the model; geoms are for the eye only."""
     model = physics.default(XML)
     hull = model.geom("hull").id
@@ -170,7 +205,6 @@ def _changes(
         *[("body_inertia", (body, axis), value / 3.0) for axis, value in enumerate(inertia)],
         ("geom_size", (hull, 0), 0.5 * length),
         ("geom_pos", (model.geom("nose").id, 0), 0.5 * length - 0.005),
-        ("geom_pos", (model.geom("goal").id, 2), -goal_depth),
         ("opt.density", (), density),
         *[("jnt_stiffness", model.joint(f"flex_{leg}").id, stiffness) for leg in LEGS],
     ]

@@ -106,7 +106,7 @@ def test_goals_are_reached_where_they_should_be():
         x[entry] = value
         assert saturating(plant, jnp.asarray(x)) < 1e-6
         assert saturating(plant, jnp.asarray(level)) > 0.8
-        assert saturating(plant, jnp.asarray(x).at[3].add(0.3)) > 0.1
+        assert saturating(plant, jnp.asarray(x).at[3].add(0.3)) > 0.05
     spin = level.copy()
     for degrees in (-120.0, -60.0):
         spin[4] = np.radians(degrees)
@@ -149,13 +149,13 @@ def test_constants_can_be_mapped_over(swim):
 # Mean |e|^2 over 20 s, from starts not used in the search; a random policy has more than .9 in all of them.
 BARS = {
     (2, "knife_edge"): 0.03,
-    (2, "belly_up"): 0.08,
-    (2, "corkscrew"): 0.03,
-    (2, "depth_change"): 0.24,
-    (6, "knife_edge"): 0.03,
-    (6, "belly_up"): 0.08,
-    (6, "corkscrew"): 0.03,
-    (6, "depth_change"): 0.12,
+    (2, "belly_up"): 0.06,
+    (2, "corkscrew"): 0.012,
+    (2, "depth_change"): 0.20,
+    (6, "knife_edge"): 0.02,
+    (6, "belly_up"): 0.05,
+    (6, "corkscrew"): 0.01,
+    (6, "depth_change"): 0.06,
 }
 
 
@@ -186,4 +186,4 @@ def test_every_manoeuvre_can_be_done(swim):
         late = squares[:, base.horizon // 2 :]
         print(f"{legs} legs, {task}: mean |e|^2 {squares.mean():.4f} (last 10 s {late.mean():.4f})")
         assert squares.mean() < BARS[legs, task], task
-        assert late.mean() < 0.03, task
+        assert late.mean() < 0.04, task
