@@ -3,6 +3,7 @@
 Everything here is a plain function or a plain value, to be jitted, vmapped and differentiated in your own code.
 """
 
+from pegasus_jax import tasks
 from pegasus_jax.build import build, compose
 from pegasus_jax.config import Config
 from pegasus_jax.fit import fit
@@ -11,4 +12,4 @@ from pegasus_jax.scenarios import draw
 from pegasus_jax.search import objective, optimise
 from pegasus_jax.trial import run, trial
 
-__all__ = ["Config", "build", "compose", "draw", "fit", "objective", "optimise", "rollout", "run", "trial"]
+__all__ = ["Config", "build", "compose", "draw", "fit", "objective", "optimise", "rollout", "run", "tasks", "trial"]
