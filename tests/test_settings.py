@@ -44,6 +44,7 @@ SPELLINGS = [
     ("policy.hidden=[50,50]", "policy.hidden", (50, 50)),
     ("policy.hidden=[ 50, 60 ]", "policy.hidden", (50, 60)),
     ("policy.hidden=[7]", "policy.hidden", (7,)),
+    ("legs=6", "legs", 6),
     ("seed=3", "seed", 3),
     ("seed=4294967295", "seed", 2**32 - 1),
     ("trials=10", "trials", 10),
@@ -172,6 +173,9 @@ WRONG = [
     (["model.dropout=null"], ["model.dropout=null is not a word"]),
     (["seed=${trials}"], ["seed=", "is not a whole number"]),
     # impossible values
+    (["legs=4"], ["legs=4 is not a choice", "choices: 2, 6"]),
+    (["task=swimmer_belly_up", "legs=many"], ["legs=many is not a whole number", "for example legs=2"]),
+    (["task=swimmer_knifeedge"], ["did you mean 'swimmer_knife_edge'?"]),
     (["trials=0"], ["trials=0 is out of range", "the nearest is 1"]),
     (["seed=-1"], ["seed=-1", "the nearest is 0"]),
     (["seed=99999999999"], ["seed=99999999999 ", "the nearest is 4294967295"]),

@@ -26,6 +26,7 @@ examples
   pegasus-train task=cartpole
   pegasus-train task=cartpole policy.hidden=[50,50] seed=3 trials=10 out=runs/demo
   pegasus-train task=cartpole algorithm=deep_pilco search.clip=1
+  pegasus-train task=swimmer_corkscrew legs=6
   pegasus-train resume=runs/demo trials=20
 
 Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, or tensorboard --logdir RUN/tensorboard.
@@ -106,7 +107,7 @@ def _plot(words: Sequence[str]) -> None:
     from pegasus_jax.report.plot import run_pictures
 
     config = settings.load(run / "config.yaml")
-    for path in run_pictures(run, tasks.make(config.task)):
+    for path in run_pictures(run, tasks.make(config.task, config.legs)):
         print(path)
 
 

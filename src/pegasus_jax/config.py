@@ -24,7 +24,7 @@ def nearest(name: str, choices: Iterable[str]) -> str:
     return f"{hint}choices: {', '.join(choices)}"
 
 
-def _choice(name: str, value: str, choices: Iterable[str]) -> None:
+def _choice(name: str, value: Any, choices: Iterable[Any]) -> None:
     if value not in tuple(choices):
         raise SettingError(f"{name}={value} is not a choice; {nearest(value, choices)}")
 
@@ -57,6 +57,7 @@ SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
 AGGREGATES = ("mean", "total")
 EXECUTIONS = ("sampled", "mean")
+LEGS = (2, 6)
 
 
 @dataclass(frozen=True)
@@ -188,6 +189,7 @@ class Config:
     """One run."""
 
     task: str = setting("cartpole", "what to learn")
+    legs: int = setting(2, "that a swimmer drives: 2 or 6; the other tasks have none")
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
     model: BNN = BNN()
@@ -197,6 +199,7 @@ class Config:
     explore: Explore = Explore()
 
     def __post_init__(self) -> None:
+        _choice("legs", self.legs, LEGS)
         _within("seed", self.seed, 0, 2**32 - 1)
         _within("trials", self.trials, 1, 10_000)
 

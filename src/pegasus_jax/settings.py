@@ -39,7 +39,8 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
         model=MODELS.get(chosen.get("model", ""), Config.model),
         policy=POLICIES.get(chosen.get("policy", ""), Config.policy),
     )
-    config = override(config, tasks.DEFAULTS[config.task])
+    config = override(config, values({key: words[key] for key in ("legs",) if key in words}))
+    config = override(config, tasks.defaults(config.task, config.legs))
     config = override(config, ALGORITHMS[chosen.get("algorithm", "pegasus")])
     known = leaves(config)
     for key in words:

@@ -1,10 +1,14 @@
 """Task names -> tasks. The only importer of pegasus_envs."""
 
 from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Any, get_args
 
 from pegasus_envs.cartpole import cartpole
+from pegasus_envs.double_cartpole import double_cartpole
+from pegasus_envs.goals import Task as Manoeuvre
 from pegasus_envs.plant import Plant
+from pegasus_envs.swimmer import swimmer
 from pegasus_jax.config import SettingError, nearest
 from pegasus_jax.cost import saturating
 from pegasus_jax.types import Task
@@ -29,18 +33,52 @@ def of_plant(name: str, plant: Plant) -> Task:
     )
 
 
-TASKS: dict[str, Callable[[], Plant]] = {
-    "cartpole": cartpole,
+# Name -> the plant, given how many of its legs a swimmer drives.
+TASKS: dict[str, Callable[[Any], Plant]] = {
+    "cartpole": lambda legs: cartpole(),
+    "double_cartpole": lambda legs: double_cartpole(),
+    **{f"swimmer_{manoeuvre}": partial(swimmer, manoeuvre) for manoeuvre in get_args(Manoeuvre)},
 }
 
-# What a task changes in the defaults of config.py, by dotted name.
-DEFAULTS: dict[str, dict[str, Any]] = {
-    "cartpole": {},
+# Reference settings 2.2; the issue's networks and step size.
+_DOUBLE_CARTPOLE: dict[str, Any] = {
+    "trials": 40,
+    "model.hidden": (200,) * 4,
+    "policy.hidden": (50,) * 4,
+    "search.learning_rate": 1e-4,
+    "explore.trials": 2,
+}
+
+# Reference settings 3.4; what the legs do not change. The policy's dropout is the paper's .1, as everywhere.
+_SWIMMER: dict[str, Any] = {
+    "trials": 50,
+    "model.hidden": (200,) * 4,
+    "model.initialiser": "orthogonal",
+    "policy.hidden": (200,) * 4,
+    "policy.initialiser": "orthogonal",
+    "search.steps": 500,
+    "search.learning_rate": 1e-4,
+    "explore.trials": 5,
+    "explore.kind": "walk",
+}
+_LEGS: dict[int, dict[str, Any]] = {
+    2: {"search.particles": 400, "fit.steps": 2000},
+    6: {"search.particles": 500, "fit.steps": 4000},
 }
 
 
-def make(name: str) -> Task:
-    """The task of that name. Raises SettingError for an unknown one."""
+def defaults(name: str, legs: int = 2) -> dict[str, Any]:
+    """What a task changes in the defaults of config.py, by dotted name."""
+    if name == "cartpole":
+        return {}
+    if name == "double_cartpole":
+        return _DOUBLE_CARTPOLE
+    faster = {"search.learning_rate": 1e-3} if (name, legs) == ("swimmer_depth_change", 2) else {}
+    return {**_SWIMMER, **_LEGS[legs], **faster}
+
+
+def make(name: str, legs: int = 2) -> Task:
+    """The task of that name; only the swimmer has legs. Raises SettingError for an unknown one."""
     if name not in TASKS:
         raise SettingError(f"task={name} is unknown; {nearest(name, TASKS)}")
-    return of_plant(name, TASKS[name]())
+    return of_plant(name, TASKS[name](legs))

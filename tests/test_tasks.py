@@ -1,0 +1,99 @@
+"""Every task builds with its own defaults, obeys its plant's limits, and learns through the command line."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_jax import record, settings, tasks
+from pegasus_jax.build import build
+from pegasus_jax.config import Config, SettingError
+
+# (task, legs, states, controls, horizon, control period [s])
+SHAPES = [
+    ("cartpole", 2, 4, 1, 25, 0.1),
+    ("double_cartpole", 2, 6, 1, 30, 0.1),
+    *((f"swimmer_{name}", 2, 7, 4, 20, 1.0) for name in ("knife_edge", "belly_up", "corkscrew", "depth_change")),
+    *((f"swimmer_{name}", 6, 13, 18, 40, 0.5) for name in ("knife_edge", "belly_up", "corkscrew", "depth_change")),
+]
+
+TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=1"]
+TINY += ["explore.trials=0"]  # the episode is the untrained policy's
+
+
+def parse(*words: str) -> Config:
+    return settings.parse(settings.split(words)[1])
+
+
+def test_every_task_is_listed_here() -> None:
+    assert {name for name, *_ in SHAPES} == {*tasks.TASKS}
+
+
+@pytest.mark.parametrize(("name", "legs", "states", "controls", "horizon", "dt"), SHAPES)
+def test_a_task_builds(name: str, legs: int, states: int, controls: int, horizon: int, dt: float) -> None:
+    """Its shapes are the paper's, and its cost is low at no start and 1 at most."""
+    experiment = build(parse(f"task={name}", f"legs={legs}"))
+    task = experiment.task
+    assert (len(task.state_names), len(task.control_names), task.horizon, task.dt) == (states, controls, horizon, dt)
+    start = jnp.asarray(task.start_mean, jnp.float32)
+    assert 0.5 < task.cost(start) <= 1
+    assert jax.eval_shape(experiment.init, jax.random.key(0)).data.x.shape[1] == states
+    policy = experiment.policy
+    push = jax.tree.map(lambda leaf: 1e3 * jnp.ones_like(leaf), policy.init(jax.random.key(0)))
+    for params in (push, jax.tree.map(jnp.negative, push)):
+        u = np.asarray(policy.apply(params, None, start))
+        assert np.all((u >= task.control_low - 1e-5) & (u <= task.control_high + 1e-5))
+
+
+def test_tasks_bring_their_defaults() -> None:
+    """Issue 4 and reference settings 2.2 and 3.4; a setting on the line wins over them."""
+    double = parse("task=double_cartpole")
+    assert (double.model.hidden, double.policy.hidden) == ((200,) * 4, (50,) * 4)
+    assert (double.search.learning_rate, double.explore.trials, double.trials) == (1e-4, 2, 40)
+    two, six = parse("task=swimmer_belly_up"), parse("task=swimmer_belly_up", "legs=6", "trials=8")
+    for config in (two, six):
+        assert (config.model.hidden, config.policy.hidden, config.policy.dropout) == ((200,) * 4, (200,) * 4, 0.1)
+        assert (config.explore.trials, config.explore.kind, config.search.steps) == (5, "walk", 500)
+    assert (two.search.particles, two.fit.steps, two.trials) == (400, 2000, 50)
+    assert (six.search.particles, six.fit.steps, six.trials) == (500, 4000, 8)
+    rates = {legs: parse("task=swimmer_depth_change", f"legs={legs}").search.learning_rate for legs in (2, 6)}
+    assert rates == {2: 1e-3, 6: 1e-4}
+    assert parse("task=swimmer_belly_up", "policy=mlp").policy.dropout == 0
+    assert parse("task=swimmer_belly_up", "algorithm=deep_pilco").search.particles == 10
+
+
+def test_the_resolved_config_survives_its_file(tmp_path: Path) -> None:
+    config = parse("task=swimmer_corkscrew", "legs=6", "search.particles=20")
+    settings.save(config, tmp_path / "config.yaml")
+    assert settings.load(tmp_path / "config.yaml") == config
+
+
+def test_an_unknown_task_is_named() -> None:
+    with pytest.raises(SettingError, match="did you mean 'double_cartpole'"):
+        tasks.make("double_cartpol")
+
+
+@pytest.mark.parametrize("words", [["task=double_cartpole"], ["task=swimmer_knife_edge", "legs=2"]], ids=" ".join)
+def test_a_tiny_trial_through_the_command_line(words: list[str], tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    program = [sys.executable, "-c", "from pegasus_jax.cli import train; train()"]
+    done = subprocess.run(
+        [*program, *words, *TINY, f"out={run}"], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    (row,) = record.trials(run)
+    assert not row["random"]
+    assert all(np.isfinite(value) for value in row.values() if isinstance(value, float))
+    task = tasks.make(words[0].removeprefix("task="))
+    episode = record.load_episode(run, 1)
+    assert episode is not None
+    assert np.all((episode.u >= task.control_low - 1e-5) & (episode.u <= task.control_high + 1e-5))
+    assert np.ptp(episode.u, axis=0).min() > 0
+    assert words[0] in json.loads((run / "run.json").read_text())["command"]
