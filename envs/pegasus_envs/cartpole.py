@@ -1,12 +1,14 @@
 """Cart-pole swing-up: a cart on a rail carries a freely turning rod, which a force on the cart shall swing upright."""
 
+from functools import partial
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from pegasus_envs import physics
 from pegasus_envs.physics import Motion, Scalar
-from pegasus_envs.plant import Plant, draw_start
+from pegasus_envs.plant import FRAME, Plant, draw_start, gliding
 
 XML = "cartpole.xml"
 
@@ -37,8 +39,8 @@ def cartpole(
     def place(x: Array) -> Motion:
         return Motion(jnp.stack([x[0], x[3]]), jnp.stack([x[1], x[2]]))
 
-    def step(motion: Motion, control: Array) -> Motion:
-        return physics.hold(system, motion, jnp.clip(control, low, high), dt)
+    def step(motion: Motion, control: Array, duration: float = dt) -> Motion:
+        return physics.hold(system, motion, jnp.clip(control, low, high), duration)
 
     def observe(motion: Motion) -> Array:
         (position, angle), (speed, rate) = motion
@@ -52,6 +54,7 @@ def cartpole(
     return Plant(
         reset=lambda key: place(draw_start(key, start_mean, start_std)),
         step=step,
+        glide=gliding(partial(step, duration=FRAME), dt),
         observe=observe,
         place=place,
         error=error,

@@ -1,12 +1,14 @@
 """Double cart-pole swing-up: two rods in series on a cart, both to be swung upright by a force on the cart."""
 
+from functools import partial
+
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from pegasus_envs import physics
 from pegasus_envs.physics import Motion, Scalar
-from pegasus_envs.plant import Plant, draw_start
+from pegasus_envs.plant import FRAME, Plant, draw_start, gliding
 
 XML = "double_cartpole.xml"
 
@@ -45,8 +47,8 @@ def double_cartpole(
         position, speed, rate_one, rate_two, one, two = x
         return Motion(jnp.stack([position, one, two - one]), jnp.stack([speed, rate_one, rate_two - rate_one]))
 
-    def step(motion: Motion, control: Array) -> Motion:
-        return physics.hold(system, motion, jnp.clip(control, low, high), dt)
+    def step(motion: Motion, control: Array, duration: float = dt) -> Motion:
+        return physics.hold(system, motion, jnp.clip(control, low, high), duration)
 
     def observe(motion: Motion) -> Array:
         (position, one, bend), (speed, rate, bend_rate) = motion
@@ -62,6 +64,7 @@ def double_cartpole(
     return Plant(
         reset=lambda key: place(draw_start(key, start_mean, start_std)),
         step=step,
+        glide=gliding(partial(step, duration=FRAME), dt),
         observe=observe,
         place=place,
         error=error,

@@ -12,6 +12,10 @@ State = Any
 """A small pytree: positions, velocities and whatever else the next step needs."""
 
 
+FRAME = 0.05
+"""from one picture of a film to the next [s]; a whole number of them in every control period"""
+
+
 class Plant(NamedTuple):
     """One task's physics, sensors, goal and limits. D states, U controls, E entries of the goal error."""
 
@@ -19,6 +23,8 @@ class Plant(NamedTuple):
     """key -> physical state, drawn from N(start_mean, diag(start_std^2))"""
     step: Callable[[State, Array], State]
     """(state, control [U]) -> state one control period later; the control is held, and clipped to its limits"""
+    glide: Callable[[State, Array], State]
+    """(state, control [U]) -> the states [n, ...] on the way, one each `FRAME` seconds, for films"""
     observe: Callable[[State], Array]
     """state -> x [D], free of noise"""
     place: Callable[[Array], State]
@@ -50,6 +56,19 @@ def saturating(plant: Plant, x: Array) -> Array:
     """The task's cost of x [D], in [0, 1): 0 at the goal, near 1 far from it."""
     error = plant.error(x)
     return -jnp.expm1(-0.5 * (error @ error) / plant.width**2)
+
+
+def gliding(move: Callable[[State, Array], State], dt: float) -> Callable[[State, Array], State]:
+    """A plant's `glide`: `move` goes on by `FRAME` seconds, the control period is `dt`."""
+
+    def glide(state: State, control: Array) -> State:
+        def advance(state: State, _: None) -> tuple[State, State]:
+            following = move(state, control)
+            return following, following
+
+        return jax.lax.scan(advance, state, None, length=round(dt / FRAME))[1]
+
+    return glide
 
 
 def draw_start(key: Array, mean: np.ndarray, std: np.ndarray) -> Array:

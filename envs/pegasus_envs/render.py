@@ -36,6 +36,8 @@ def graphics_context(width: int, height: int) -> Any:
         try:
             context = import_module(f"mujoco.{name}").GLContext(width, height)
             context.make_current()
+            if name == "glfw" and not import_module("glfw").get_current_context():
+                raise RuntimeError("no window can be opened")  # GLFW itself only warns
             return context
         except Exception as error:
             failures.append(f"{name}: {error or type(error).__name__}")

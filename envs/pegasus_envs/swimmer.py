@@ -2,7 +2,7 @@
 
 import copy
 from collections.abc import Callable
-from functools import cache
+from functools import cache, partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -14,7 +14,7 @@ from pegasus_envs import physics
 from pegasus_envs.attitude import angles_of, quaternion_of
 from pegasus_envs.goals import START_DEPTH, Cost, Task, goal
 from pegasus_envs.physics import Motion, Scalar
-from pegasus_envs.plant import Plant, draw_start
+from pegasus_envs.plant import FRAME, Plant, draw_start, gliding
 
 XML = "swimmer.xml"
 LEGS = ("FL", "ML", "RL", "FR", "MR", "RR")
@@ -85,6 +85,7 @@ def swimmer(
     return Plant(
         reset=lambda key: body.place(draw_start(key, start_mean, start_std)),
         step=body.step,
+        glide=body.glide,
         observe=body.observe,
         place=body.place,
         error=aim.error,
@@ -109,6 +110,7 @@ class _Body(NamedTuple):
 
     place: Callable[[Array], Swimming]
     step: Callable[[Swimming, Array], Swimming]
+    glide: Callable[[Swimming, Array], Swimming]
     observe: Callable[[Swimming], Array]
     model: Any
 
@@ -130,7 +132,7 @@ def _new_body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
     system = physics.load(XML, _changes(*constants))
     tick, dimensions = system.host.opt.timestep, 7 if legs == 2 else 13
     low, high = _limits(legs)
-    count, window = physics.substeps(system, _PERIODS[legs]), round(1.0 / stroke_rate / tick)
+    dt, window = _PERIODS[legs], round(1.0 / stroke_rate / tick)
     keep = np.exp(-tick / LAG)
 
     def place(x: Array) -> Swimming:
@@ -141,7 +143,7 @@ def _new_body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
         qpos = jnp.concatenate([position, quaternion_of(x[:3]), joints])
         return Swimming(qpos, qvel, jnp.zeros((3, 6), x.dtype), jnp.zeros((), x.dtype), x[4:7])
 
-    def step(state: Swimming, control: Array) -> Swimming:
+    def step(state: Swimming, control: Array, duration: float = dt) -> Swimming:
         target = _leg_commands(jnp.clip(control, low, high), legs)
 
         def substep(carry: tuple[Motion, Array, Array], _: None) -> tuple[tuple[Motion, Array, Array], Array]:
@@ -152,14 +154,14 @@ def _new_body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
             return (motion, command, stroke - jnp.floor(stroke)), motion.qvel[3:6]
 
         carry = Motion(state.qpos, state.qvel), state.command, state.stroke
-        (motion, command, stroke), rates = jax.lax.scan(substep, carry, None, length=count)
+        (motion, command, stroke), rates = jax.lax.scan(substep, carry, None, length=physics.substeps(system, duration))
         return Swimming(*motion, command, stroke, rates[-window:].mean(axis=0))
 
     def observe(state: Swimming) -> Array:
         depth, hips = -state.qpos[2:3], state.qpos[HIPS]
         return jnp.concatenate([angles_of(state.qpos[3:7]), depth, state.rate, hips])[:dimensions]
 
-    return _Body(place, step, observe, system.host)
+    return _Body(place, step, gliding(partial(step, duration=FRAME), dt), observe, system.host)
 
 
 def hip_angles(command: Array, stroke: Array) -> Array:

@@ -1,6 +1,7 @@
 """One episode of a controller on a simulated plant."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,6 +14,13 @@ def run(key: Key, act: Callable[[Key, Array, Array], Array], task: Task) -> Traj
 
     The controller and the data see the state with sensor noise; the cost is of the true state.
     """
+    return watch(key, act, task, lambda state, u: ())[0]
+
+
+def watch(
+    key: Key, act: Callable[[Key, Array, Array], Array], task: Task, look: Callable[[Any, Array], Any]
+) -> tuple[Trajectory, Any]:
+    """`run`, and what `look(plant's state, u [U])` returned at the beginning of each control period [H, ...]."""
     assert task.plant is not None, f"task {task.name} has no simulated plant"
     plant = task.plant
     begin, first, steps = jax.random.split(key, 3)
@@ -22,20 +30,21 @@ def run(key: Key, act: Callable[[Key, Array, Array], Array], task: Task) -> Traj
         x = plant.observe(state)
         return x + sensor_std * jax.random.normal(key, x.shape)
 
-    def step(carry: tuple, t_and_key: tuple[Array, Key]) -> tuple[tuple, tuple[Array, Array, Array]]:
+    def step(carry: tuple, t_and_key: tuple[Array, Key]) -> tuple[tuple, tuple[Array, Array, Array, Any]]:
         state, x = carry
         t, key = t_and_key
         act_key, sensor_key = jax.random.split(key)
         u = act(act_key, t, x)
+        looked = look(state, u)
         state = plant.step(state, u)
         after = measure(sensor_key, state)
-        return (state, after), (after, u, task.cost(plant.observe(state)))
+        return (state, after), (after, u, task.cost(plant.observe(state)), looked)
 
     state = plant.reset(begin)
     x = measure(first, state)
     times = jnp.arange(task.horizon)
-    _, (xs, us, costs) = jax.lax.scan(step, (state, x), (times, jax.random.split(steps, task.horizon)))
-    return Trajectory(jnp.concatenate([x[None], xs]), us, costs)
+    _, (xs, us, costs, looks) = jax.lax.scan(step, (state, x), (times, jax.random.split(steps, task.horizon)))
+    return Trajectory(jnp.concatenate([x[None], xs]), us, costs), looks
 
 
 def uniform(key: Key, low: Array, high: Array, horizon: int) -> Array:

@@ -4,10 +4,13 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, get_args
 
+import numpy as np
+
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.goals import Task as Manoeuvre
 from pegasus_envs.plant import Plant
+from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
 from pegasus_jax.config import SettingError, nearest
 from pegasus_jax.cost import saturating
@@ -82,3 +85,8 @@ def make(name: str, legs: int = 2) -> Task:
     if name not in TASKS:
         raise SettingError(f"task={name} is unknown; {nearest(name, TASKS)}")
     return of_plant(name, TASKS[name](legs))
+
+
+def pictures(task: Task, states: Any, width: int, height: int) -> list[np.ndarray]:
+    """Pictures [height, width, 3] of stacked states [N, ...] of the task's plant."""
+    return frames(task.plant, unstack(states), width, height)

@@ -191,13 +191,18 @@ def latest(run: Path, config: Config, display: Display) -> RunState | None:
     return None
 
 
-def evaluate_run(run: Path, episodes: int, seed: int) -> dict[str, Any]:
-    """How the newest policy of a run does on its plant, and the run's fingerprint."""
+def newest(run: Path) -> tuple[Config, Experiment, RunState]:
+    """A run's config, its experiment and its newest whole state. Raises RunError when there is none yet."""
     config = settings.load(run / "config.yaml")
     state = latest(run, config, Display(config.trials, 0))
     if state is None:
         raise RunError(f"{run} has no whole checkpoint yet")
-    experiment = build(config)
+    return config, build(config), state
+
+
+def evaluate_run(run: Path, episodes: int, seed: int) -> dict[str, Any]:
+    """How the newest policy of a run does on its plant, and the run's fingerprint."""
+    _, experiment, state = newest(run)
     result = evaluate(jax.random.key(seed), state, experiment.task, Jitted(experiment.episode), episodes)
     return {"trial": int(state.trial), "episodes": episodes, **result, "fingerprint": checkpoint.fingerprint(state)}
 

@@ -6,6 +6,7 @@ import sys
 import warnings
 
 import gymnasium
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -13,8 +14,8 @@ from gymnasium.utils.env_checker import check_env
 
 from pegasus_envs import IDS
 from pegasus_envs.gym import PlantEnv
-from pegasus_envs.plant import saturating
-from pegasus_envs.render import Renderer, frames
+from pegasus_envs.plant import FRAME, saturating
+from pegasus_envs.render import Renderer, frames, unstack
 
 # Gymnasium's own environments get these two: controls in physical units, sensors without bounds.
 HARMLESS = ("symmetric and normalized space", "Box observation space")
@@ -74,6 +75,21 @@ def test_pictures_show_the_motion(name):
     assert one.std() > 10
     assert np.abs(one.astype(int) - two).max() > 50
     np.testing.assert_array_equal(one, same)
+
+
+@pytest.mark.parametrize(
+    "name", ["pegasus/CartPoleSwingUp-v0", "pegasus/DoubleCartPole-v0", "pegasus/Swimmer2KnifeEdge-v0"]
+)
+def test_a_film_ends_each_period_where_the_plant_does(name):
+    """`glide` passes through `FRAME`-spaced states, none like the one before it, to the state that `step` gives."""
+    plant = gymnasium.make(name).unwrapped.plant
+    state = plant.place(jnp.asarray(plant.start_mean + 0.1, jnp.float32))
+    control = jnp.asarray(0.7 * plant.control_high, jnp.float32)
+    on_the_way, after = jax.jit(plant.glide)(state, control), jax.jit(plant.step)(state, control)
+    positions = np.stack([plant.qpos(entry) for entry in unstack(on_the_way)])
+    assert len(positions) * FRAME == pytest.approx(plant.dt)
+    np.testing.assert_allclose(positions[-1], plant.qpos(after), atol=1e-4)
+    assert np.abs(np.diff(positions, axis=0)).max(axis=1).min() > 1e-3
 
 
 def test_no_way_to_draw_ends_in_advice(monkeypatch, env):
