@@ -22,7 +22,7 @@ EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 @lru_cache(maxsize=64)
 def build(config: settings.Config) -> Experiment:
     """The experiment of a config. Cached: the same config gives the same functions, which compile once."""
-    return compose(config, tasks.make(config.task, config.legs))
+    return compose(config, tasks.of_config(config))
 
 
 def compose(

@@ -27,6 +27,7 @@ examples
   pegasus-train task=cartpole policy.hidden=[50,50] seed=3 trials=10 out=runs/demo
   pegasus-train task=cartpole algorithm=deep_pilco search.clip=1
   pegasus-train task=swimmer_corkscrew legs=6
+  pegasus-train task=gym env=Pendulum-v1 cost=mymodule:cost horizon=40
   pegasus-train resume=runs/demo trials=20
 
 Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, pegasus-play RUN, or
@@ -126,7 +127,7 @@ def _plot(words: Sequence[str]) -> None:
     from pegasus_jax.report.plot import run_pictures
 
     config = settings.load(run / "config.yaml")
-    for path in run_pictures(run, tasks.make(config.task, config.legs)):
+    for path in run_pictures(run, tasks.of_config(config)):
         print(path)
 
 
@@ -166,9 +167,9 @@ def _help(text: str) -> str:
         return text
     from pegasus_jax import settings
     from pegasus_jax.config import ALGORITHMS, MODELS, POLICIES
-    from pegasus_jax.tasks import TASKS
+    from pegasus_jax.tasks import NAMES
 
-    named = dict(tasks=TASKS, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
+    named = dict(tasks=NAMES, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
     lists = {name: ", ".join(values) for name, values in named.items()}
     return text.format(settings="\n".join(settings.help_lines(Config())), **lists)
 

@@ -190,6 +190,10 @@ class Config:
 
     task: str = setting("cartpole", "what to learn")
     legs: int = setting(2, "that a swimmer drives: 2 or 6; the other tasks have none")
+    env: str | None = setting(None, "of task=gym: the environment's Gymnasium id")
+    cost: str | None = setting(None, "of task=gym: module:function, observation [D] -> cost in [0, 1], in JAX")
+    angles: tuple[int, ...] = setting((), "of task=gym: the entries of the observation that are angles [rad]")
+    horizon: int | None = setting(None, "of task=gym: control periods an episode; null: the environment's own limit")
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
     model: BNN = BNN()
@@ -200,6 +204,9 @@ class Config:
 
     def __post_init__(self) -> None:
         _choice("legs", self.legs, LEGS)
+        object.__setattr__(self, "angles", tuple(self.angles))
+        if self.horizon is not None:
+            _within("horizon", self.horizon, 1)
         _within("seed", self.seed, 0, 2**32 - 1)
         _within("trials", self.trials, 1, 10_000)
 

@@ -12,7 +12,7 @@ from pegasus_jax import tasks
 from pegasus_jax.config import ALGORITHMS, MODELS, POLICIES, Config, SettingError, nearest
 
 # Keys that select a named variant, and what they select from.
-VARIANTS: dict[str, Any] = {"task": tasks.TASKS, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
+VARIANTS: dict[str, Any] = {"task": tasks.NAMES, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
 
 
 def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, str], dict[str, str]]:
@@ -153,6 +153,8 @@ def _kind(annotation: Any) -> str:
         bool: "true or false",
         str: "a word",
         tuple[int, ...]: "a list of whole numbers",
+        str | None: "a word or null",
+        int | None: "a whole number or null",
     }.get(annotation, "a number or null")
 
 

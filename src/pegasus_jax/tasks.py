@@ -1,7 +1,10 @@
 """Task names -> tasks. The only importer of pegasus_envs."""
 
+import os
+import sys
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from typing import Any, get_args
 
 import numpy as np
@@ -9,10 +12,11 @@ import numpy as np
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.goals import Task as Manoeuvre
+from pegasus_envs.guest import guest
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
-from pegasus_jax.config import SettingError, nearest
+from pegasus_jax.config import Config, SettingError, nearest
 from pegasus_jax.cost import saturating
 from pegasus_jax.types import Task
 
@@ -43,6 +47,9 @@ TASKS: dict[str, Callable[[Any], Plant]] = {
     **{f"swimmer_{manoeuvre}": partial(swimmer, manoeuvre) for manoeuvre in get_args(Manoeuvre)},
 }
 
+GYM = "gym"  # the task that `env=` and `cost=` describe
+NAMES = (*TASKS, GYM)
+
 # Reference settings 2.2; the issue's networks and step size.
 _DOUBLE_CARTPOLE: dict[str, Any] = {
     "trials": 40,
@@ -72,7 +79,7 @@ _LEGS: dict[int, dict[str, Any]] = {
 
 def defaults(name: str, legs: int = 2) -> dict[str, Any]:
     """What a task changes in the defaults of config.py, by dotted name."""
-    if name == "cartpole":
+    if name in ("cartpole", GYM):
         return {}
     if name == "double_cartpole":
         return _DOUBLE_CARTPOLE
@@ -85,6 +92,53 @@ def make(name: str, legs: int = 2) -> Task:
     if name not in TASKS:
         raise SettingError(f"task={name} is unknown; {nearest(name, TASKS)}")
     return of_plant(name, TASKS[name](legs))
+
+
+def of_config(config: Config) -> Task:
+    """The task that a config names."""
+    return of_guest(config) if config.task == GYM else make(config.task, config.legs)
+
+
+def of_guest(config: Config) -> Task:
+    """The task that a Gymnasium environment and a cost of its observations pose. Raises SettingError if they cannot."""
+    if config.env is None or config.cost is None:
+        raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
+    try:
+        plant = guest(config.env)
+    except ValueError as error:
+        raise SettingError(f"env={config.env}: {error}") from error
+    states, controls = len(plant.start_mean), len(plant.control_low)
+    for angle in config.angles:
+        if not 0 <= angle < states:
+            raise SettingError(
+                f"angles={angle} is not an entry of {config.env}'s observation; choose from 0 to {states - 1}"
+            )
+    return Task(
+        name=config.env,
+        plant=plant,
+        cost=_function(config.cost),
+        angles=config.angles,
+        start_mean=plant.start_mean,
+        start_std=plant.start_std,
+        sensor_std=np.zeros(states),
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        horizon=config.horizon or plant.horizon,
+        dt=plant.dt,
+        state_names=tuple(f"x{i}" for i in range(states)),
+        control_names=tuple(f"u{i}" for i in range(controls)),
+    )
+
+
+def _function(name: str) -> Callable[[Any], Any]:
+    """The function `module:function`, also from a module in the working folder."""
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
+    module, _, function = name.partition(":")
+    try:
+        return getattr(import_module(module), function)
+    except (ImportError, AttributeError, ValueError) as error:
+        raise SettingError(f"cost={name} cannot be imported: {error}; expected cost=module:function") from error
 
 
 def pictures(task: Task, states: Any, width: int, height: int) -> list[np.ndarray]:
