@@ -260,7 +260,7 @@ def test_purposes_have_names_and_numbers_apart():
 
 def test_the_whole_loop_learns_a_probe():
     """The network, the dropout policy, everything: from random controls to a good policy in four episodes of six
-    steps. The goal lies on the seam at 180 degrees, so differences that do not wrap teach nothing here."""
+    steps. The way leads over the seam at 180 degrees, so differences that do not wrap teach nothing here."""
     exp = compose(tiny(), dial())
     _, info = unchecked(jax.jit(run(exp, 4, 20)))(jax.random.key(1))
     last = info.evaluation[-1]
