@@ -47,7 +47,7 @@ def test_the_loss_is_eq_2_over_n(kind, heteroscedastic, full):
     know the base draws; its KL is then far from zero.
     """
     data = experience()
-    model = network(kind, heteroscedastic, full_whitening=full, weight_decay=0.7)
+    model = network(kind, heteroscedastic, full_whitening=full, weight_decay=3.0, head=HEADS["softplus"])
     params = jax.jit(model.init)(jax.random.key(0))
     if kind == "log_normal":
         params["noise"] = ({}, {"location": jnp.full(8, 12.0), "scale": jnp.full(8, -30.0)})
@@ -68,13 +68,14 @@ def test_the_loss_is_eq_2_over_n(kind, heteroscedastic, full):
     )
     mean = mean_out + out[:, :3] @ root_out.T
     raw = out[:, 3:] if heteroscedastic else np.zeros((6, 3))
-    std = (0.1 / (1 + np.exp(-raw)) + 1e-6) * np.diag(root_out)
+    std = (np.log1p(np.exp(raw)) + 1e-6) * np.diag(root_out)
     misfit = 0.5 * ((np.asarray(BATCH.y) - mean) / std) ** 2 + np.log(std)
-    penalty = 0.35 * sum(np.sum(layer[k] ** 2) for layer in layers for k in ("kernel", "bias"))
+    penalty = 1.5 * sum(np.sum(layer[k] ** 2) for layer in layers for k in ("kernel", "bias"))
     if kind == "log_normal":
         penalty += log_normal_kl(params["noise"][1])
     expected = misfit.sum(1).mean() + penalty / size
-    np.testing.assert_allclose(loss, expected, rtol=3e-2 if kind == "log_normal" else 2e-3)
+    np.testing.assert_allclose(loss, expected, rtol=1e-2 if kind == "log_normal" else 1e-3)
+    assert penalty / size > 0.1 * abs(expected)  # so that a wrong penalty, or N, would show
 
 
 def test_binary_dropout_thins_the_weight_prior_of_the_layers_it_acts_on():

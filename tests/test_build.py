@@ -117,10 +117,10 @@ def eagerly(function):
     return call
 
 
-def searcher(**search):
-    """A state with a gain that is not zero, and a one-step search from it."""
+def searcher(gain=-0.5, **search):
+    """An experiment under a config, its first state, and a one-step search from it."""
     chosen = dataclasses.replace(tiny(), search=config.Search(**{"steps": 1, "particles": 5, **search}))
-    policy = linear_policy(2, 1)._replace(init=lambda key: jnp.array([[-0.5, -0.8]]))
+    policy = linear_policy(2, 1)._replace(init=lambda key: gain * jnp.array([[1.0, 1.6]]))
     exp = compose(chosen, cart(horizon=2), dynamics=known(PENDULUM, noise_std=0.2), policy=policy)
     return exp, exp.init(jax.random.key(0)), eagerly(exp.search)
 
@@ -133,12 +133,31 @@ def first_objective(**search):
 def test_settings_of_the_search_reach_the_objective():
     plain = first_objective()
     changes = dict(match=False, balanced=True, discount=0.5, aggregate="total")
-    changes |= dict(policy_noise=0.0, state_noise=1.0, cost_noise=1.0)
     values = {name: first_objective(**{name: value}) for name, value in changes.items()}
     np.testing.assert_allclose(values.pop("aggregate"), 2 * plain, rtol=1e-4)  # the sum over 2 steps
     assert values["discount"] < 0.9 * plain
     assert all(abs(value - plain) > 1e-6 for value in values.values()), values
     assert len(set(values.values())) == len(values)
+
+
+def test_each_factor_of_the_noise_reaches_its_place():
+    """What the policy sees decides its controls, the state's own noise the states, the cost's only what it sees."""
+
+    def imagined(**search):
+        exp, state, _ = searcher(**{"match": False, "policy_noise": 0.0, **search})
+        return eagerly(exp.imagine)(state)[0]
+
+    plain = imagined()
+    blur = np.asarray(imagined(cost_noise=1.0).seen - plain.seen)
+    assert np.all(blur != 0)
+    seen = imagined(cost_noise=0.5)
+    assert np.array_equal(seen.x, plain.x)
+    np.testing.assert_allclose(seen.seen - plain.seen, 0.5 * blur, atol=1e-5)
+    moved = imagined(state_noise=0.5)
+    np.testing.assert_allclose(moved.x[1] - plain.x[1], 0.5 * blur[0], atol=1e-5)
+    told = imagined(policy_noise=0.5)
+    np.testing.assert_allclose((told.u - plain.u)[1, :, 0], 0.5 * blur[0] @ np.array([-0.5, -0.8]), atol=1e-5)
+    assert np.array_equal(told.x[1], plain.x[1])
 
 
 def test_as_few_particles_as_are_allowed_do():

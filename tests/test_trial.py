@@ -9,7 +9,7 @@ import pytest
 
 from pegasus_jax.build import compose
 from pegasus_jax.config import Period
-from pegasus_jax.trial import COLLECT, EVALUATE, FIT, IMAGINE, SEARCH, TrialInfo, run, trial_key
+from pegasus_jax.trial import COLLECT, EVALUATE, FIT, IMAGINE, RESTART, SEARCH, TrialInfo, run, trial_key
 from probes import cart, dial, noisy_linear_policy, regression, same, tiny, unchecked
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
@@ -234,7 +234,9 @@ def test_no_two_purposes_trials_or_iterations_share_a_key():
         return wrapped
 
     task = cart(horizon=3)
-    config = tiny(**{**QUICK, "fit__steps": 4, "search__steps": 3}, search__period=Period(1, 1, 1, 1, 1))
+    config = tiny(
+        **{**QUICK, "fit__steps": 4, "search__steps": 3}, search__restart=False, search__period=Period(1, 1, 1, 1, 1)
+    )
     dynamics, policy = regression(2, 1), noisy_linear_policy(task)
     exp = compose(
         config,
@@ -251,16 +253,16 @@ def test_no_two_purposes_trials_or_iterations_share_a_key():
 
 
 def test_purposes_have_names_and_numbers_apart():
-    purposes = [COLLECT, FIT, SEARCH, IMAGINE, EVALUATE]
+    purposes = [COLLECT, FIT, SEARCH, IMAGINE, EVALUATE, RESTART]
     root = jax.random.key(0)
     keys = {jax.random.key_data(trial_key(root, t, p)).tobytes() for t in range(1, 40) for p in purposes}
-    assert len(keys) == 39 * 5
+    assert len(keys) == 39 * 6
     assert jax.random.key_data(root).tobytes() not in keys
 
 
 def test_the_whole_loop_learns_a_probe():
     """The network, the dropout policy, everything: from random controls to a good policy in four episodes of six
-    steps. The goal lies on the seam at 180 degrees, so differences that do not wrap teach nothing here."""
+    steps. The way leads over the seam at 180 degrees, so differences that do not wrap teach nothing here."""
     exp = compose(tiny(), dial())
     _, info = unchecked(jax.jit(run(exp, 4, 20)))(jax.random.key(1))
     last = info.evaluation[-1]

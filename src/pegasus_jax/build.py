@@ -33,10 +33,10 @@ def compose(
     dynamics = dynamics or dynamics_of(config.model, task)
     policy = policy or policy_of(config.policy, task)
     low, high = (jnp.asarray(limit, jnp.float32) for limit in (task.control_low, task.control_high))
-    if search.match and search.particles <= len(task.state_names):
+    if (search.match or search.balanced) and search.particles <= len(task.state_names):
+        states, what = len(task.state_names), "moment matching" if search.match else "balanced draws"
         raise settings.SettingError(
-            f"search.particles={search.particles} is too few: moment matching of {len(task.state_names)} state "
-            f"dimensions needs at least {len(task.state_names) + 1}"
+            f"search.particles={search.particles} is too few: {what} of {states} dimensions needs at least {states + 1}"
         )
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
     return trial.experiment(
@@ -65,6 +65,7 @@ def compose(
         search_optimizer=guarded(optax.chain(clip, optax.adam(search.learning_rate))),
         search_steps=search.steps,
         search_reset=search.reset,
+        search_restart=search.restart,
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
         mean_execution=config.policy.execution == "mean",
@@ -99,7 +100,14 @@ def dynamics_of(config: settings.BNN, task: Task) -> Dynamics:
 
 
 def dropout_of(config: settings.BNN) -> Dropout:
-    """The configured noise on a model's units."""
+    """The configured noise on a model's units. Raises SettingError for parameters it cannot have."""
+    try:
+        return _dropout_of(config)
+    except ValueError as error:
+        raise settings.SettingError(f"model.dropout={config.dropout}: {error}") from error
+
+
+def _dropout_of(config: settings.BNN) -> Dropout:
     match config.dropout:
         case "log_normal":
             return dropout.log_normal(config.low, config.high)

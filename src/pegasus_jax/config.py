@@ -31,15 +31,22 @@ def _choice(name: str, value: Any, choices: Iterable[Any]) -> None:
 
 def _within(name: str, value: float, low: float, high: float = math.inf, *, open_low: bool = False) -> None:
     if not math.isfinite(value) or value > high or value < low or (open_low and value == low):
-        interval = f"{'(' if open_low else '['}{low:g}, {high:g}{')' if high == math.inf else ']'}"
+        interval = f"{'(' if open_low else '['}{_number(low)}, {_number(high)}{')' if high == math.inf else ']'}"
         nearest_value = min(max(value, low), high) if math.isfinite(value) and not open_low else None
-        hint = f"; the nearest is {nearest_value:g}" if nearest_value is not None else ""
-        raise SettingError(f"{name}={value:g} is out of range; expected a number in {interval}{hint}")
+        hint = f"; the nearest is {_number(nearest_value)}" if nearest_value is not None else ""
+        raise SettingError(f"{name}={_number(value)} is out of range; expected a number in {interval}{hint}")
+
+
+def _number(value: float) -> str:
+    """A number in full when it is whole, else short."""
+    return str(int(value)) if math.isfinite(value) and value == int(value) else f"{value:g}"
 
 
 def _layers(name: str, value: Any) -> tuple[int, ...]:
     layers = tuple(value)
     for width in layers:
+        if not isinstance(width, int):
+            raise SettingError(f"{name}={list(layers)} is not a list of whole numbers; for example {name}=[200,200]")
         _within(name, width, 1)
     return layers
 
@@ -73,9 +80,9 @@ class BNN:
     heteroscedastic: bool = setting(True, "predicted noise depends on the input")
     head: str = setting("sigmoid", "form of the predicted noise: sigmoid (at most .1 of the target's scale), softplus")
     whitening: str = setting("full", "scaling of inputs and targets: full covariance, or diagonal")
-    kl_weight: float = setting(1.0, "factor of the noise's KL divergence; 1 is the variational bound")
+    kl_weight: float = setting(0.1, "factor of the noise's KL divergence; 1 is the variational bound")
     weight_decay: float = setting(1.0, "factor of the Gaussian prior on the weights")
-    activation: str = setting("relu", "nonlinearity: relu, silu, tanh")
+    activation: str = setting("silu", "nonlinearity: relu, silu, tanh")
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
@@ -88,6 +95,8 @@ class BNN:
         _choice("model.initialiser", self.initialiser, INITIALISERS)
         _within("model.rate", self.rate, 0, 0.99)
         _within("model.weight_decay", self.weight_decay, 0)
+        _within("model.low", self.low, -math.inf)
+        _within("model.high", self.high, -math.inf)
         if not self.low < self.high:
             raise SettingError(f"model.low={self.low:g} must be less than model.high={self.high:g}")
 
@@ -118,7 +127,7 @@ class Fit:
 
     steps: int = setting(2000, "updates a trial")
     batch: int = setting(100, "rows an update")
-    learning_rate: float = setting(1e-4, "Adam's step size")
+    learning_rate: float = setting(3e-4, "Adam's step size")
     reset: bool = setting(False, "forget Adam's moments at each trial")
 
     def __post_init__(self) -> None:
@@ -132,10 +141,10 @@ class Period:
     """For how many iterations each draw of the scenarios is kept; 0: the whole search of a trial."""
 
     start: int = setting(1, "first states")
-    dynamics: int = setting(0, "draws of the model")
-    policy: int = setting(0, "draws of the policy")
-    sensor: int = setting(0, "noise on what the policy sees")
-    match: int = setting(0, "noise of the moment matching")
+    dynamics: int = setting(100, "draws of the model")
+    policy: int = setting(1, "draws of the policy")
+    sensor: int = setting(1, "noise on what the policy sees")
+    match: int = setting(1, "noise of the moment matching")
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):
@@ -155,6 +164,7 @@ class Search:
     aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
     discount: float = setting(1.0, "weight of a later step against the one before")
     reset: bool = setting(True, "forget Adam's moments at each trial")
+    restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
     policy_noise: float = setting(1.0, "factor of the predicted noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
     cost_noise: float = setting(0.0, "factor of the predicted noise on what the cost sees")
@@ -225,8 +235,20 @@ POLICIES: dict[str, MLP] = {
     "mlp": MLP(dropout=0.0),
 }
 ALGORITHMS: dict[str, dict[str, Any]] = {
-    "pegasus": {},
-    "deep_pilco": {  # Alg. 2
+    "pegasus": {},  # the defaults: what learned best (docs/decisions/0001)
+    "paper": {  # Alg. 3 as printed: all draws but the start particles held for a whole search
+        "model.activation": "relu",
+        "model.kl_weight": 1.0,
+        "fit.learning_rate": 1e-4,
+        "search.period": {"start": 1, "dynamics": 0, "policy": 0, "sensor": 0, "match": 0},
+        "search.reset": False,
+        "search.restart": False,
+    },
+    "deep_pilco": {  # Alg. 2: everything redrawn every iteration, no clipping
+        "model.activation": "relu",
+        "model.kl_weight": 1.0,
+        "fit.learning_rate": 1e-4,
+        "search.restart": False,
         "search.particles": 10,
         "search.clip": None,
         "search.period": {"start": 1, "dynamics": 1, "policy": 1, "sensor": 1, "match": 1},

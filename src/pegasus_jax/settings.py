@@ -7,9 +7,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
 
 from pegasus_jax import tasks
 from pegasus_jax.config import ALGORITHMS, MODELS, POLICIES, Config, SettingError, nearest
+from pegasus_jax.record import write_whole
 
 # Keys that select a named variant, and what they select from.
 VARIANTS: dict[str, Any] = {"task": tasks.NAMES, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
@@ -55,15 +57,8 @@ def values(words: dict[str, str]) -> dict[str, Any]:
 
 
 def override(config: Config, changes: dict[str, Any]) -> Config:
-    """The config with dotted settings changed; each value is converted to its setting's type, or refused."""
-    for key, value in changes.items():
-        head, _, rest = key.partition(".")
-        if not rest:
-            config = _replaced(config, key, value, key)
-            continue
-        section = _replaced(getattr(config, head), rest, value, key)
-        config = dataclasses.replace(config, **{head: section})
-    return config
+    """The config with dotted settings changed, all at once; each value becomes its setting's type, or is refused."""
+    return _changed(config, changes, "")
 
 
 def leaves(node: Any, prefix: str = "") -> dict[str, Any]:
@@ -91,24 +86,26 @@ def help_lines(node: Any, prefix: str = "") -> list[str]:
 
 
 def save(config: Config, path: Path) -> None:
-    """Write the resolved config as YAML that `load` reads."""
-    OmegaConf.save(
-        OmegaConf.create({k: list(v) if isinstance(v, tuple) else v for k, v in leaves(config).items()}), path
-    )
+    """Write the resolved config as YAML that `load` reads; the file appears whole or not at all."""
+    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in leaves(config).items()}
+    text = OmegaConf.to_yaml(OmegaConf.create(plain))
+    write_whole(path, lambda file: file.write(text.encode()))
 
 
 def load(path: Path) -> Config:
     """The config that `save` wrote. Raises SettingError when it is not one."""
     try:
-        stored = OmegaConf.to_container(OmegaConf.load(path))
-        assert isinstance(stored, dict)
-        config = Config(task=stored.pop("task", Config.task))
-        unknown = set(stored) - set(leaves(config))
-        if unknown:
-            raise SettingError(f"{path}: unknown settings {', '.join(sorted(map(str, unknown)))}")
-        return override(config, {str(k): v for k, v in stored.items()})
-    except (OSError, AssertionError, OmegaConfBaseException) as error:
-        raise SettingError(f"{path} is not the config of a run: {error}") from error
+        stored: Any = OmegaConf.to_container(OmegaConf.load(path))
+    except (OSError, ValueError, OmegaConfBaseException, YAMLError) as error:
+        raise SettingError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    config = Config()
+    wrong = sorted(set(map(str, stored)) ^ set(leaves(config)))
+    if wrong:
+        raise SettingError(f"{path} is not the config of a run of this version: see {', '.join(wrong[:5])}")
+    try:
+        return override(config, stored)
+    except SettingError as error:
+        raise SettingError(f"{path}: {error}") from error
 
 
 def _hint(key: str, choices: Sequence[str]) -> str:
@@ -121,29 +118,38 @@ def _value(key: str, text: str) -> Any:
     try:
         return OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]))["value"]  # type: ignore[index,call-overload]
     except Exception as error:
-        raise SettingError(f"{key}={text} cannot be read as a value") from error
+        raise SettingError(f"{key}={_text(text)} cannot be read as a value") from error
 
 
-def _replaced(node: Any, name: str, value: Any, key: str) -> Any:
-    """A copy of the dataclass with one (possibly nested) field set to a converted value."""
-    head, _, rest = name.partition(".")
-    current = getattr(node, head)
-    if rest:
-        return dataclasses.replace(node, **{head: _replaced(current, rest, value, key)})
-    if dataclasses.is_dataclass(current) and isinstance(value, dict):
-        return dataclasses.replace(node, **{head: dataclasses.replace(current, **value)})  # type: ignore[type-var]
-    field = next(f for f in dataclasses.fields(node) if f.name == head)
-    schema = OmegaConf.structured(dataclasses.make_dataclass("One", [(head, field.type, current)]))
+def _changed(node: Any, changes: dict[str, Any], prefix: str) -> Any:
+    """A copy of the dataclass with dotted fields changed together: some limit each other."""
+    here: dict[str, Any] = {}
+    below: dict[str, dict[str, Any]] = {}
+    for key, value in changes.items():
+        head, _, rest = key.partition(".")
+        if rest:
+            below.setdefault(head, {})[rest] = value
+        elif dataclasses.is_dataclass(getattr(node, head)) and isinstance(value, dict):
+            below.setdefault(head, {}).update(value)
+        else:
+            here[head] = _converted(node, head, value, prefix + head)
+    here |= {head: _changed(getattr(node, head), inner, f"{prefix}{head}.") for head, inner in below.items()}
+    return dataclasses.replace(node, **here)
+
+
+def _converted(node: Any, name: str, value: Any, key: str) -> Any:
+    """The value as the type of the dataclass's field of that name."""
+    current = getattr(node, name)
+    field = next(f for f in dataclasses.fields(node) if f.name == name)
+    schema = OmegaConf.structured(dataclasses.make_dataclass("One", [(name, field.type, current)]))
     try:
-        merged = OmegaConf.merge(schema, {head: value})
+        merged = OmegaConf.merge(schema, {name: value})
         assert isinstance(merged, DictConfig)
-        converted = OmegaConf.to_object(merged)
-    except OmegaConfBaseException as error:
+        return getattr(OmegaConf.to_object(merged), name)
+    except (OmegaConfBaseException, TypeError, ValueError) as error:
         raise SettingError(
             f"{key}={_text(value)} is not {_kind(field.type)}; for example {key}={_text(current)}"
         ) from error
-    converted = getattr(converted, head)
-    return dataclasses.replace(node, **{head: converted})
 
 
 def _kind(annotation: Any) -> str:
@@ -165,4 +171,5 @@ def _text(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, tuple | list):
         return "[" + ",".join(map(str, value)) + "]"
-    return f"{value:g}" if isinstance(value, float) else str(value)
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text if text.isprintable() else repr(text)

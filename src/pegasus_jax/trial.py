@@ -29,7 +29,7 @@ from pegasus_jax.types import (
 )
 
 # What the key of a trial is folded with, so that no two draws share a key.
-COLLECT, FIT, SEARCH, IMAGINE, EVALUATE = range(5)
+COLLECT, FIT, SEARCH, IMAGINE, EVALUATE, RESTART = range(6)
 
 
 class TrialInfo(NamedTuple):
@@ -64,6 +64,7 @@ def experiment(
     search_optimizer: optax.GradientTransformation,
     search_steps: int,
     search_reset: bool,
+    search_restart: bool,
     explore: Callable[[Key], Array],
     explore_trials: int,
     mean_execution: bool,
@@ -72,6 +73,7 @@ def experiment(
     """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned."""
     states, controls = len(task.state_names), len(task.control_names)
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, match=match, noise=noise)
+    imagined_cost = partial(objective, **pieces, cost=cost, aggregate=aggregate)
     scenario: dict[str, Any] = dict(blocks=blocks, period=period)
 
     def init(key: Key) -> RunState:
@@ -126,22 +128,39 @@ def experiment(
 
     def search(state: RunState, first: Array | int = 0, steps: int = search_steps) -> tuple[RunState, SearchInfo]:
         """Improve the policy in imagination (Alg. 1 line 6), from iteration `first` of the trial's search."""
-        learner = state.policy
-        if search_reset:
-            fresh = Learner(learner.params, search_optimizer.init(learner.params))
-            learner = jax.tree.map(partial(jnp.where, jnp.asarray(first) == 0), fresh, learner)
+        key = trial_key(state.key, state.trial, SEARCH)
+        belief = dynamics.condition(state.model.params, state.data)
+
+        def begin(learner: Learner) -> Learner:
+            """The learner of iteration 0, when the model is new."""
+            params = learner.params
+            if search_restart:
+                params = restarted(key, params, belief, policy.init(trial_key(state.key, state.trial, RESTART)))
+            return Learner(params, search_optimizer.init(params)) if search_reset else learner._replace(params=params)
+
         learner, info = optimise(
-            trial_key(state.key, state.trial, SEARCH),
-            learner,
-            dynamics.condition(state.model.params, state.data),
+            key,
+            jax.lax.cond(jnp.asarray(first) == 0, begin, lambda learner: learner, state.policy),
+            belief,
             draw=partial(draw, **scenario),
             redraw=partial(redraw, **scenario),
-            objective=partial(objective, **pieces, cost=cost, aggregate=aggregate),
+            objective=imagined_cost,
             optimizer=search_optimizer,
             steps=steps,
             first=first,
         )
         return state._replace(policy=learner), info
+
+    def restarted(key: Key, params: Params, belief: Params, fresh: Params) -> Params:
+        """`params`, or `fresh` when the new model expects no more of `params`.
+
+        A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, so a policy
+        that knows nothing is the better start. A tie goes to the fresh one; a model that imagines NaN changes nothing.
+        """
+        scenarios = draw(key, 0, belief, **scenario)
+        candidates = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, fresh)
+        kept, new = jax.vmap(imagined_cost, (0, None, None))(candidates, belief, scenarios)
+        return jax.tree.map(partial(jnp.where, new <= kept), fresh, params)
 
     def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
         state, fitted = learn(state)
@@ -170,6 +189,12 @@ def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunStat
 
 def run(exp: Experiment, trials: int, episodes: int = 20) -> Callable[[Key], tuple[RunState, TrialInfo]]:
     """key -> (state, TrialInfo [T, ...]): a whole run as one function; jit(vmap(run(...)))(keys) is a study."""
+
+    room = jax.eval_shape(exp.init, jax.random.key(0)).data.x.shape[0] // exp.task.horizon
+    if trials > room:
+        raise ValueError(
+            f"trials={trials}: the experiment was built with room for {room} episodes; Config(trials={trials})"
+        )
 
     def whole(key: Key) -> tuple[RunState, TrialInfo]:
         return jax.lax.scan(lambda state, _: trial(state, exp, episodes), exp.init(key), None, trials)
