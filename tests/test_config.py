@@ -23,8 +23,8 @@ def test_layers_given_as_a_list_are_still_hashable():
     assert hash(MLP(hidden=[50, 50])) == hash(MLP(hidden=(50, 50)))  # type: ignore[arg-type]
 
 
-def test_the_defaults_are_the_papers_cartpole_runs():
-    """Reference settings 1.2, 4.2, 4.7, 5.2: a change here changes every result."""
+def test_the_defaults_are_the_measured_ones():
+    """docs/decisions/0001: a change here changes every result. test_settings holds algorithm=paper to the paper."""
     c = Config()
     assert (c.model.hidden, c.model.dropout, c.model.heteroscedastic, c.model.whitening) == (
         (200, 200),
@@ -33,10 +33,11 @@ def test_the_defaults_are_the_papers_cartpole_runs():
         "full",
     )
     assert (c.policy.hidden, c.policy.dropout, c.policy.execution) == ((200, 200), 0.1, "sampled")
-    assert (c.fit.steps, c.fit.batch, c.fit.learning_rate, c.fit.reset) == (2000, 100, 1e-4, False)
+    assert (c.fit.steps, c.fit.batch, c.fit.learning_rate, c.fit.reset) == (2000, 100, 3e-4, False)
     assert (c.search.steps, c.search.particles, c.search.learning_rate, c.search.clip) == (1000, 100, 1e-3, 1.0)
     assert (c.search.match, c.search.aggregate, c.search.discount) == (True, "mean", 1.0)
-    assert c.search.period == Period(start=1, dynamics=0, policy=0, sensor=0, match=0)
+    assert c.search.period == Period(start=1, dynamics=100, policy=1, sensor=1, match=1)
+    assert (c.model.activation, c.model.kl_weight, c.search.restart) == ("silu", 0.1, True)
     assert (c.explore.trials, c.explore.kind) == (1, "uniform")
 
 

@@ -125,8 +125,18 @@ def test_a_variant_brings_defaults_that_single_settings_change():
     words = "model=binary", "algorithm=deep_pilco", "search.clip=1", "model.rate=.3", "search.period.match=0"
     for order in (words, words[::-1]):
         chosen = parse(*order)
-        assert chosen.model == BNN(dropout="binary", rate=0.3)
-        assert chosen.search == Search(particles=10, clip=1.0, period=Period(1, 1, 1, 1, 0))
+        assert chosen.model == BNN(dropout="binary", rate=0.3, activation="relu", kl_weight=1.0)
+        assert chosen.search == Search(particles=10, clip=1.0, restart=False, period=Period(1, 1, 1, 1, 0))
+
+
+def test_the_paper_is_a_variant():
+    """Alg. 3 and reference settings 1.2, 4.7, 5.2, 5.5: all draws but the start held for the whole search."""
+    chosen = parse("algorithm=paper")
+    assert chosen.search.period == Period(start=1, dynamics=0, policy=0, sensor=0, match=0)
+    assert (chosen.model.activation, chosen.model.kl_weight, chosen.fit.learning_rate) == ("relu", 1.0, 1e-4)
+    assert (chosen.search.clip, chosen.search.particles) == (1, 100)
+    assert not chosen.search.reset
+    assert not chosen.search.restart
 
 
 def test_options_are_kept_from_the_settings():
