@@ -62,12 +62,13 @@ def test_every_variant_has_the_shapes_of_the_loop(model, policy):
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_every_algorithm_is_a_matter_of_periods_particles_and_clipping(algorithm):
     chosen = settings.parse({"algorithm": algorithm})
-    if algorithm == "pegasus":
-        assert chosen.search.period == Period(start=1, dynamics=0, policy=0, sensor=0, match=0)
-        assert (chosen.search.particles, chosen.search.clip) == (100, 1.0)
-    else:  # Alg. 2
-        assert chosen.search.period == Period(1, 1, 1, 1, 1)
-        assert (chosen.search.particles, chosen.search.clip) == (10, None)
+    periods, particles, clip = {
+        "pegasus": (Period(start=1, dynamics=100, policy=1, sensor=1, match=1), 100, 1.0),  # docs/decisions/0001
+        "paper": (Period(start=1, dynamics=0, policy=0, sensor=0, match=0), 100, 1.0),  # Alg. 3
+        "deep_pilco": (Period(1, 1, 1, 1, 1), 10, None),  # Alg. 2
+    }[algorithm]
+    assert chosen.search.period == periods
+    assert (chosen.search.particles, chosen.search.clip) == (particles, clip)
     jax.eval_shape(compose(dataclasses.replace(tiny(), search=chosen.search), cart()).init, jax.random.key(0))
 
 

@@ -10,6 +10,7 @@ import pytest
 from pegasus_jax.build import compose
 from pegasus_jax.config import Period
 from pegasus_jax.trial import COLLECT, EVALUATE, FIT, IMAGINE, RESTART, SEARCH, TrialInfo, run, trial_key
+from pegasus_jax.types import Policy, Prediction
 from probes import cart, dial, noisy_linear_policy, regression, same, tiny, unchecked
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
@@ -278,3 +279,31 @@ def test_a_run_longer_than_its_data_set_is_refused():
     exp = compose(tiny(**QUICK), cart(), regression(2, 1), noisy_linear_policy(cart()))
     with pytest.raises(ValueError, match="trials"):
         unchecked(jax.eval_shape)(run(exp, TRIALS + 1, 1), jax.random.key(0))
+
+
+@pytest.mark.parametrize(("offset", "kept"), [(0.0, True), (-100.0, False)])
+def test_a_search_starts_from_the_better_of_the_old_policy_and_a_fresh_one(offset, kept):
+    """A policy pushed into saturation is left behind, one that does its task goes on.
+
+    The cost is the distance of the state from 1, the old policy drives it there or, off by `offset`, far away. The
+    step size is so small that nothing moves.
+    """
+    task = cart(horizon=4)._replace(cost=lambda x: 1 - jnp.exp(-jnp.sum((x - 1) ** 2)))
+    towards = Policy(
+        init=lambda key: {"aim": jnp.full(2, -3.0)},
+        sample=lambda key: (),
+        apply=lambda params, noise, x: params["aim"][:1] - x[:1],
+    )
+    jump = regression(2, 1)._replace(
+        sample=lambda key, belief: (),
+        apply=lambda belief, draw, x, u: Prediction(jnp.broadcast_to(u, (2,)), jnp.zeros(2)),
+    )
+    config = tiny(search__steps=1, search__learning_rate=1e-12, search__match=False)
+    exp = compose(config, task, dynamics=jump, policy=towards)
+    state = jax.jit(exp.init)(jax.random.key(0))
+    old = {"aim": jnp.full(2, 1.0 + offset)}
+    state = state._replace(policy=state.policy._replace(params=old), trial=jnp.int32(1))
+    after, _ = jax.jit(exp.search)(state)
+    np.testing.assert_allclose(after.policy.params["aim"], old["aim"] if kept else -3.0, atol=1e-6)
+    resumed, _ = jax.jit(exp.search)(state, jnp.int32(1))  # not the first iteration: no second thoughts
+    np.testing.assert_allclose(resumed.policy.params["aim"], old["aim"], atol=1e-6)
