@@ -22,20 +22,15 @@ import numpy as np
 from benchmarks.study import RESULTS
 from pegasus_envs.render import frames
 from pegasus_jax import settings
-from pegasus_jax.build import build
-from pegasus_jax.progress import Display
 from pegasus_jax.record import existing
-from pegasus_jax.train import latest
+from pegasus_jax.train import newest
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 
 
 def swing_up(run: Path, path: Path, shown: int = 9) -> None:
     """Frames of one evaluation episode of a run's newest policy, side by side."""
-    config = settings.load(existing(run) / "config.yaml")
-    state = latest(run, config, Display(config.trials, 0))
-    assert state is not None, f"{run} has no checkpoint"
-    experiment = build(config)
+    _, experiment, state = newest(existing(run))
     episode = jax.jit(experiment.episode)(jax.random.key(1), state.policy.params, jnp.asarray(False))
     plant = experiment.task.plant
     times = np.linspace(0, experiment.task.horizon, shown).round().astype(int)

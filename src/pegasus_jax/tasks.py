@@ -50,7 +50,7 @@ TASKS: dict[str, Callable[[Any], Plant]] = {
 GYM = "gym"  # the task that `env=` and `cost=` describe
 NAMES = (*TASKS, GYM)
 
-# Reference settings 2.2; the networks and step size.
+# Reference settings 2.2; the paper's networks and step size.
 _DOUBLE_CARTPOLE: dict[str, Any] = {
     "trials": 40,
     "model.hidden": (200,) * 4,
