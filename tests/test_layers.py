@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
     0: "types config",
-    1: "angles dropout whiten moments gaussian cost dataset scenarios rollout episode",
+    1: "angles mesh dropout whiten moments gaussian cost dataset scenarios rollout episode",
     2: "network fit search",
     3: "dynamics. policy. trial",
     4: "tasks",
@@ -27,6 +27,7 @@ TOP = max(LAYERS)  # the layer that is an application: here modules may import e
 # (importer, imported), both of one layer below TOP.
 SIBLINGS: set[tuple[str, str]] = {
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
+    ("scenarios", "mesh"),  # where the particles that it draws lie
     ("scenarios", "moments"),  # the noise of moment matching is drawn standardised
     ("search", "fit"),  # one guarded optimiser, one count of skipped updates
 }

@@ -7,12 +7,14 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 
 from pegasus_jax import angles, cost, dropout, episode, moments, scenarios, tasks, trial
 from pegasus_jax import config as settings
 from pegasus_jax.dynamics.bnn import HEADS, bnn
 from pegasus_jax.dynamics.ensemble import ensemble
 from pegasus_jax.fit import minibatches
+from pegasus_jax.mesh import Spread, over_particles, together
 from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.squash import SQUASHES, to_limits
 from pegasus_jax.rollout import NoiseUse, rollout
@@ -37,18 +39,25 @@ EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 
 
 @lru_cache(maxsize=64)
-def build(config: settings.Config) -> Experiment:
+def build(config: settings.Config, mesh: Mesh | None = None) -> Experiment:
     """The experiment of a config. Cached: the same config gives the same functions, which compile once."""
-    return compose(config, tasks.of_config(config))
+    return compose(config, tasks.of_config(config), mesh=mesh)
 
 
 def compose(
-    config: settings.Config, task: Task, dynamics: Dynamics | None = None, policy: Policy | None = None
+    config: settings.Config,
+    task: Task,
+    dynamics: Dynamics | None = None,
+    policy: Policy | None = None,
+    mesh: Mesh | None = None,
 ) -> Experiment:
-    """The experiment of a config on any task; a model or policy of your own takes the configured one's place."""
+    """The experiment of a config on any task; a model or policy of your own takes the configured one's place.
+
+    With a `mesh` (mesh.py) the particles of a search are spread over its devices.
+    """
     dynamics = dynamics or dynamics_of(config.model, task)
     policy = policy or policy_of(config.policy, task)
-    searcher, imagine = search_of(config.search, task, dynamics, policy)
+    searcher, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)
     explore = config.explore
     return trial.experiment(
@@ -87,7 +96,9 @@ def fit_of(config: settings.Fit, dynamics: Dynamics) -> Fitter:
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]  # (key, policy parameters, belief) -> cost [H, K] too
 
 
-def search_of(search: settings.Search, task: Task, dynamics: Dynamics, policy: Policy) -> tuple[Searcher, Imagine]:
+def search_of(
+    search: settings.Search, task: Task, dynamics: Dynamics, policy: Policy, spread: Spread = together
+) -> tuple[Searcher, Imagine]:
     """The configured way of improving a policy, and fresh imagined rollouts of the same kind."""
     if (search.match or search.balanced) and search.particles <= len(task.state_names):
         states, what = len(task.state_names), "moment matching" if search.match else "balanced draws"
@@ -101,6 +112,7 @@ def search_of(search: settings.Search, task: Task, dynamics: Dynamics, policy: P
         particles=search.particles,
         horizon=task.horizon,
         balanced=search.balanced,
+        spread=spread,
     )
     pieces: dict[str, Any] = dict(
         dynamics=dynamics,
