@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = {
     0: "types config",
     1: "angles dropout whiten moments gaussian cost dataset scenarios rollout episode",
-    2: "network fit search",
+    2: "network kernel fit lbfgs search",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",
@@ -28,6 +28,7 @@ TOP = max(LAYERS)  # the layer that is an application: here modules may import e
 SIBLINGS: set[tuple[str, str]] = {
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
     ("scenarios", "moments"),  # the noise of moment matching is drawn standardised
+    ("lbfgs", "fit"),  # what every fit reports
     ("search", "fit"),  # one guarded optimiser, one count of skipped updates
 }
 
