@@ -18,7 +18,7 @@ def rosenbrock(x):
 
 
 def test_it_finds_the_minimum_that_scipy_finds(x64):
-    start = np.array([-1.2, 1.0, 0.5, 2.0, -1.0])
+    start = np.array([-1.2, 1.0, 0.5])
     found = jax.jit(lambda x: minimise(rosenbrock, x, 200))(start)
     theirs = optimize.minimize(
         rosenbrock, start, jac=jax.grad(rosenbrock), method="L-BFGS-B", options={"ftol": 1e-15, "gtol": 1e-10}

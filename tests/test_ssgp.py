@@ -93,13 +93,13 @@ def test_draws_are_functions_of_the_posterior():
         mean = here @ np.linalg.solve(precision, features.T @ y[e]) / noise**2
         np.testing.assert_allclose(image.mean[e], mean_out[e] + std_out[e] * mean, atol=1e-3)
         np.testing.assert_allclose(std[e], std_out[e] * np.sqrt(here @ np.linalg.solve(precision, here)), rtol=1e-2)
-        np.testing.assert_allclose(ahead.std[0, e], std_out[e] * noise, rtol=1e-3)
+        np.testing.assert_allclose(ahead.std[0, e], std_out[e] * noise, rtol=3e-3)
 
 
 def test_with_many_frequencies_it_is_the_gaussian_process(x64):
     """Its error falls as the square root of their number: 32 times as many make it 5.7 times as small."""
     data, process = experience(), exact.gp(**SHAPES)
-    params = parameters(1)
+    params = parameters(1, noise=0.3)
     belief = jax.jit(process.condition)(params, data)
     at = np.asarray(jnp.concatenate([data.x[:10, :2], jnp.sin(data.x[:10, 2:]), jnp.cos(data.x[:10, 2:])], 1))
     at = np.concatenate([at, np.asarray(data.u)[:10]], 1)
