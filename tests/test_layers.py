@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = {
     0: "types config",
     1: "angles mesh dropout whiten moments gaussian cost dataset scenarios rollout episode",
-    2: "network fit search",
+    2: "network kernel fit lbfgs search",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",
@@ -29,6 +29,7 @@ SIBLINGS: set[tuple[str, str]] = {
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
     ("scenarios", "mesh"),  # where the particles that it draws lie
     ("scenarios", "moments"),  # the noise of moment matching is drawn standardised
+    ("lbfgs", "fit"),  # what every fit reports
     ("search", "fit"),  # one guarded optimiser, one count of skipped updates
 }
 
