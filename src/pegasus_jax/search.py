@@ -1,7 +1,8 @@
 """Policy search: follow the gradient of the imagined cost under held scenarios (Alg. 3)."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +12,41 @@ from pegasus_jax import cost as costs
 from pegasus_jax.fit import skipped
 from pegasus_jax.rollout import NoiseUse, rollout
 from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Policy, Scenarios
+
+
+class Remembering(NamedTuple):
+    """State of an optimiser that remembers the best parameters it has seen."""
+
+    inner_state: optax.OptState
+    best_value: Array  # [] the lowest objective so far
+    best_params: Params  # that had it
+
+
+def remembering(optimizer: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
+    """The optimiser, which also remembers the parameters with the lowest `value`; see `best`.
+
+    With redrawn scenarios a value is noisy, and the lowest one partly luck: of many iterates, the best is not as good
+    as it looks.
+    """
+    optimizer = optax.with_extra_args_support(optimizer)
+
+    def init(params: Params) -> Remembering:
+        return Remembering(optimizer.init(params), jnp.full((), jnp.inf), params)
+
+    def update(gradient: Params, state: Remembering, params: Params = None, *, value: Array, **extra: Any):
+        updates, inner = optimizer.update(gradient, state.inner_state, params, value=value, **extra)
+        better = value < state.best_value
+        kept = jax.tree.map(partial(jnp.where, better), params, state.best_params)
+        return updates, Remembering(inner, jnp.where(better, value, state.best_value), kept)
+
+    return optax.GradientTransformationExtraArgs(init, update)
+
+
+def best(learner: Learner) -> Learner:
+    """The learner with the parameters that had the lowest objective, and nothing remembered any more."""
+    found = optax.tree.get(learner.optimizer, "best_params")
+    forgotten = optax.tree.set(learner.optimizer, best_value=jnp.full((), jnp.inf))
+    return Learner(found, forgotten)
 
 
 class SearchInfo(NamedTuple):
@@ -32,9 +68,19 @@ def objective(
     cost: Callable[[Array], Array],
     aggregate: Callable[[Array], Array] = costs.mean,
     noise: NoiseUse = NoiseUse(),
+    truncate: int | None = None,
 ) -> Array:
     """J(theta) (Alg. 3 line 16): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
-    imagined = rollout(policy_params, belief, scenarios, dynamics=dynamics, policy=policy, match=match, noise=noise)
+    imagined = rollout(
+        policy_params,
+        belief,
+        scenarios,
+        dynamics=dynamics,
+        policy=policy,
+        match=match,
+        noise=noise,
+        truncate=truncate,
+    )
     return aggregate(cost(imagined.seen))
 
 
@@ -55,12 +101,13 @@ def optimise(
     One call of n steps and two calls of n/2, the second with first=n/2, do the same.
     """
     first = jnp.asarray(first, jnp.int32)
+    optimizer = optax.with_extra_args_support(optimizer)
     before = skipped(learner.optimizer)
 
     def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], tuple[Array, Array]]:
         learner, scenarios = carry
         value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios)
-        updates, state = optimizer.update(gradient, learner.optimizer, learner.params)
+        updates, state = optimizer.update(gradient, learner.optimizer, learner.params, value=value)
         learner = Learner(optax.apply_updates(learner.params, updates), state)
         scenarios = redraw(key, i + 1, scenarios, belief)
         return (learner, scenarios), (value, optax.tree.norm(gradient))

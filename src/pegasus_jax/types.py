@@ -99,6 +99,8 @@ class Dynamics(NamedTuple):
     condition: Callable[[Params, Dataset], Any]  # -> belief, all that a rollout needs
     sample: Callable[[Key, Any], Params]  # (key, belief) -> draw: one function, one particle's w^(k)
     apply: Callable[[Any, Params, Array, Array], Prediction]  # (belief, draw, x [D], u [U])
+    # (belief, mean, cov of (features, u)) -> gaussian.Image of the change of state
+    moments: Callable[[Any, Array, Array], Any] | None = None
 
 
 class Policy(NamedTuple):
@@ -107,6 +109,8 @@ class Policy(NamedTuple):
     init: Callable[[Key], Params]
     sample: Callable[[Key], Params]  # base noise of one policy draw
     apply: Callable[[Params, Params, Array], Array]  # (params, noise or None: the mean policy, x [D]) -> u [U]
+    # (params, mean [F], cov of the features) -> gaussian.Image of u
+    moments: Callable[[Params, Array, Array], Any] | None = None
 
 
 class Task(NamedTuple):
@@ -128,6 +132,8 @@ class Task(NamedTuple):
     state_names: tuple[str, ...]
     control_names: tuple[str, ...]
     success: float = 0.2  # a rollout whose last five steps cost less than this on average has succeeded
+    # (mean [D], cov [D, D] of a Gaussian state) -> its expected cost; None: the cost has no closed form
+    expected_cost: Callable[[Array, Array], Array] | None = None
 
 
 class Learner(NamedTuple):
