@@ -21,7 +21,7 @@ pegasus-train resume=RUN [trials=N]             go on with a run, also one that 
 
 A named variant brings its defaults; the settings below change them one by one.
 {settings}
-
+{others}
 examples
   pegasus-train task=cartpole
   pegasus-train task=cartpole policy.hidden=[50,50] seed=3 trials=10 out=runs/demo
@@ -96,8 +96,9 @@ def _train(words: Sequence[str]) -> None:
     else:
         config = settings.parse(rest, options=("out", "resume"))
         run = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{config.task}-seed{config.seed}"))
-    from pegasus_jax.build import build
+    from pegasus_jax.build import build, set_precision
 
+    set_precision(config)
     build(config)  # so that impossible settings end here, before anything is written
     if "resume" not in options:
         record.create(run)
@@ -166,12 +167,19 @@ def _help(text: str) -> str:
     if "{settings}" not in text:
         return text
     from pegasus_jax import settings
-    from pegasus_jax.config import ALGORITHMS, MODELS, POLICIES
+    from pegasus_jax.config import ALGORITHMS, KINDS, MODELS, POLICIES
     from pegasus_jax.tasks import NAMES
 
     named = dict(tasks=NAMES, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
     lists = {name: ", ".join(values) for name, values in named.items()}
-    return text.format(settings="\n".join(settings.help_lines(Config())), **lists)
+    others = [
+        f"\nwith {section}.kind={kind}, chosen by model=, policy= or algorithm=\n"
+        + "\n".join(settings.help_lines(default, f"{section}."))
+        + "\n"
+        for section, kinds in KINDS.items()
+        for kind, default in list(kinds.items())[1:]
+    ]
+    return text.format(settings="\n".join(settings.help_lines(Config())), others="".join(others), **lists)
 
 
 def _main(command: Callable[[Sequence[str]], None], text: str) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from tensorboardX import SummaryWriter
 
 from pegasus_jax import checkpoint, record, settings
-from pegasus_jax.build import build
+from pegasus_jax.build import build, set_precision
 from pegasus_jax.config import Config, SettingError
 from pegasus_jax.dataset import grow
 from pegasus_jax.progress import Display
@@ -86,6 +86,7 @@ def train(config: Config, run: Path, *, resume: bool = False, command: str = "")
         before = settings.load(run / "config.yaml") if resume else config
         if config.trials < before.trials:
             raise SettingError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
+        set_precision(config)
         record.write_json(run / "run.json", record.about(command))
         experiment = build(config)
         program = Program(experiment, config.search.steps)
@@ -194,6 +195,7 @@ def latest(run: Path, config: Config, display: Display) -> RunState | None:
 def newest(run: Path) -> tuple[Config, Experiment, RunState]:
     """A run's config, its experiment and its newest whole state. Raises RunError when there is none yet."""
     config = settings.load(run / "config.yaml")
+    set_precision(config)
     state = latest(run, config, Display(config.trials, 0))
     if state is None:
         raise RunError(f"{run} has no whole checkpoint yet")
