@@ -30,6 +30,8 @@ SIBLINGS: set[tuple[str, str]] = {
     ("cost", "gaussian"),  # the expected cost of a Gaussian state
     ("cost", "moments"),  # of the Gaussian with the particles' mean and covariance
     ("scenarios", "moments"),  # the noise of moment matching is drawn standardised
+    ("pilco", "fit"),  # one guarded optimiser, one count of skipped updates
+    ("pilco", "search"),  # and one report of how a search went
     ("search", "fit"),  # one guarded optimiser, one count of skipped updates
 }
 

@@ -1,20 +1,23 @@
-"""PILCO's objective: the expected cost of a Gaussian state, propagated analytically through policy and model.
+"""PILCO's search: the expected cost of a Gaussian state propagated through policy and model, minimised by L-BFGS.
 
-Deisenroth & Rasmussen 2011; Deisenroth 2010, ch. 3. A deterministic function of policy parameters and belief: neither
-keys nor scenarios.
+Deisenroth & Rasmussen 2011; Deisenroth 2010, ch. 3. The objective is a deterministic function of policy parameters and
+belief: neither keys nor scenarios.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from pegasus_jax import cost as costs
+from pegasus_jax.fit import guarded, skipped
 from pegasus_jax.gaussian import Image, chain, joint, residual, sincos
 from pegasus_jax.rollout import NoiseUse
-from pegasus_jax.types import Array, Dynamics, Params, Policy
+from pegasus_jax.search import SearchInfo
+from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Policy, Searcher
 
 
 class Gaussians(NamedTuple):
@@ -96,7 +99,42 @@ def objective(
     noise: NoiseUse = NoiseUse(),
 ) -> Array:
     """J(theta): the expected cost of the steps 1..H, [H, 1], made one number by `aggregate`."""
-    pieces = dict(dynamics=dynamics, policy=policy, angles=angles)
+    pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, angles=angles)
     states = propagate(policy_params, belief, start, std, horizon=horizon, noise=noise, **pieces)
     widened = states.cov[1:] + noise.cost**2 * jnp.diag(std**2)
     return aggregate(jax.vmap(expected_cost)(states.mean[1:], widened)[:, None])
+
+
+def analytic(
+    objective: Callable[[Params, Params, Array], Array], noise_std: Callable[[Key, Params], Array], memory: int = 20
+) -> Searcher:
+    """The searcher that minimises `objective(policy parameters, belief, std)` by L-BFGS with `memory` past steps.
+
+    Zoom line search (Nocedal & Wright 2006, alg. 3.5 and 7.5). `noise_std(key, belief)` is the model's noise std [D].
+    A search knows nothing of the ones before: their curvature and their values were another model's.
+    """
+    optimizer = guarded(optax.lbfgs(memory_size=memory))
+
+    def run(
+        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int
+    ) -> tuple[Learner, SearchInfo]:
+        std = noise_std(key, belief)
+        new = jnp.asarray(first) == 0
+        state = jax.tree.map(partial(jnp.where, new), optimizer.init(learner.params), learner.optimizer)
+        before = skipped(state)
+
+        def value(params: Params) -> Array:
+            return objective(params, belief, std)
+
+        evaluate = optax.value_and_grad_from_state(value)
+
+        def iterate(learner: Learner, _: None) -> tuple[Learner, tuple[Array, Array]]:
+            params, state = learner
+            cost, gradient = evaluate(params, state=state)
+            updates, state = optimizer.update(gradient, state, params, value=cost, grad=gradient, value_fn=value)
+            return Learner(optax.apply_updates(params, updates), state), (cost, optax.tree.norm(gradient))
+
+        learner, (values, norms) = jax.lax.scan(iterate, Learner(learner.params, state), None, steps)
+        return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
+
+    return Searcher(optimizer.init, run, lambda key, params, belief: objective(params, belief, noise_std(key, belief)))

@@ -24,11 +24,7 @@ class Remembering(NamedTuple):
 
 
 def remembering(optimizer: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
-    """The optimiser, which also remembers the parameters with the lowest `value`; see `best`.
-
-    With redrawn scenarios a value is noisy, and the lowest one partly luck: of many iterates, the best is not as good
-    as it looks.
-    """
+    """The optimiser, which also remembers the parameters with the lowest `value`; see `keeping_best`."""
     optimizer = optax.with_extra_args_support(optimizer)
 
     def init(params: Params) -> Remembering:
@@ -41,13 +37,6 @@ def remembering(optimizer: optax.GradientTransformation) -> optax.GradientTransf
         return updates, Remembering(inner, jnp.where(better, value, state.best_value), kept)
 
     return optax.GradientTransformationExtraArgs(init, update)
-
-
-def best(learner: Learner) -> Learner:
-    """The learner with the parameters that had the lowest objective, and nothing remembered any more."""
-    found = optax.tree.get(learner.optimizer, "best_params")
-    forgotten = optax.tree.set(learner.optimizer, best_value=jnp.full((), jnp.inf))
-    return Learner(found, forgotten)
 
 
 class SearchInfo(NamedTuple):
@@ -138,3 +127,22 @@ def particles(
         run=partial(optimise, **pieces),
         value=lambda key, params, belief: objective(params, belief, pieces["draw"](key, 0, belief)),
     )
+
+
+def keeping_best(searcher: Searcher, last: int) -> Searcher:
+    """The searcher that ends a trial's search of `last` iterations with the best parameters it met, not the last.
+
+    Its optimiser must be `remembering`. Values are compared as they are, like the authors' option to return the best:
+    with redrawn scenarios each is noisy, so the lowest is partly luck, and not as good as it looks.
+    """
+
+    def run(key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int) -> tuple[Learner, Any]:
+        known = optax.tree.get(learner.optimizer, "best_value")
+        known = jnp.where(jnp.asarray(first) == 0, jnp.inf, known)  # what an older model thought does not count
+        learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, best_value=known))
+        learner, info = searcher.run(key, learner, belief, first=first, steps=steps)
+        best = optax.tree.get(learner.optimizer, "best_params")
+        kept = jax.tree.map(partial(jnp.where, first + steps >= last), best, learner.params)
+        return learner._replace(params=kept), info
+
+    return searcher._replace(run=run)
