@@ -10,9 +10,9 @@ import optax
 
 from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco, scenarios, tasks, trial
 from pegasus_jax import config as settings
+from pegasus_jax.cost import of_particles
 from pegasus_jax.dynamics.bnn import HEADS, bnn
 from pegasus_jax.dynamics.ensemble import ensemble
-from pegasus_jax.cost import of_particles
 from pegasus_jax.fit import minibatches
 from pegasus_jax.policy.linear import linear
 from pegasus_jax.policy.mlp import mlp
