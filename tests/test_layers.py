@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = {
     0: "types config",
     1: "angles dropout whiten moments gaussian cost dataset scenarios rollout episode",
-    2: "network fit search pilco",
+    2: "network kernel fit lbfgs search pilco",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",
@@ -32,6 +32,7 @@ SIBLINGS: set[tuple[str, str]] = {
     ("scenarios", "moments"),  # the noise of moment matching is drawn standardised
     ("pilco", "fit"),  # one guarded optimiser, one count of skipped updates
     ("pilco", "search"),  # and one report of how a search went
+    ("lbfgs", "fit"),  # what every fit reports
     ("search", "fit"),  # one guarded optimiser, one count of skipped updates
 }
 

@@ -1,4 +1,4 @@
-"""Sparse-spectrum Gaussian-process dynamics: Bayesian linear regression on trained waves (the paper's PILCO baseline)."""
+"""Sparse-spectrum Gaussian-process dynamics: Bayesian linear regression on trained waves, the paper's PILCO."""
 
 from functools import partial
 from typing import NamedTuple
@@ -52,9 +52,7 @@ def ssgp(*, states: int, controls: int, angles: tuple[int, ...], points: int = 1
         """-(log evidence of the scaled targets) and both penalties [nats a row]."""
         del key, batch
         h = kernel.hyper(params)
-        evidence = jax.vmap(log_evidence, (0, 0, 0, 0, None))(
-            frequencies_of(params), h.signal, h.noise, rows.y, rows
-        )
+        evidence = jax.vmap(log_evidence, (0, 0, 0, 0, None))(frequencies_of(params), h.signal, h.noise, rows.y, rows)
         high = jnp.sum(jnp.mean(jnp.sum(params["points"] ** 2, -1), -1))
         return (kernel.penalty(h) + high - jnp.sum(evidence)) / rows.size
 
