@@ -97,7 +97,7 @@ GOALS = {
     "double_cartpole": np.zeros(6),
     "swimmer_knife_edge_2": [np.pi / 2, 0, 0, 1, 0, 0, 0],
     "swimmer_belly_up_2": [np.pi, 0, 0, 1, 0, 0, 0],
-    "swimmer_corkscrew_2": [0.7, 0, 0, 1, np.pi / 3, 0, 0],
+    "swimmer_corkscrew_2": [0.7, 0, 0, 1, -2 * np.pi / 3, 0, 0],
     "swimmer_depth_change_2": [0, 0, 0, 2, 0, 0, 0],
 }
 

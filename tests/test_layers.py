@@ -30,9 +30,10 @@ SIBLINGS: set[tuple[str, str]] = {
     ("cost", "gaussian"),  # the expected cost of a Gaussian state
     ("cost", "moments"),  # of the Gaussian with the particles' mean and covariance
     ("scenarios", "moments"),  # the noise of moment matching is drawn standardised
-    ("pilco", "fit"),  # one guarded optimiser, one count of skipped updates
+    ("pilco", "lbfgs"),  # one L-BFGS for model and policy
     ("pilco", "search"),  # and one report of how a search went
     ("lbfgs", "fit"),  # what every fit reports
+    ("policy.external", "policy.squash"),  # every controller saturates the same ways
     ("search", "fit"),  # one guarded optimiser, one count of skipped updates
 }
 

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import optax
 
 from pegasus_jax import cost as costs
-from pegasus_jax.fit import guarded, skipped
+from pegasus_jax import lbfgs
 from pegasus_jax.gaussian import Image, chain, joint, residual, sincos
 from pegasus_jax.rollout import NoiseUse
 from pegasus_jax.search import SearchInfo
@@ -106,35 +106,29 @@ def objective(
 
 
 def analytic(
-    objective: Callable[[Params, Params, Array], Array], noise_std: Callable[[Key, Params], Array], memory: int = 20
+    objective: Callable[[Params, Params, Array], Array], noise_std: Callable[[Key, Params], Array]
 ) -> Searcher:
-    """The searcher that minimises `objective(policy parameters, belief, std)` by L-BFGS with `memory` past steps.
+    """The searcher that minimises `objective(policy parameters, belief, std)` by L-BFGS, as far as that goes.
 
-    Zoom line search (Nocedal & Wright 2006, alg. 3.5 and 7.5). `noise_std(key, belief)` is the model's noise std [D].
-    A search knows nothing of the ones before: their curvature and their values were another model's.
+    `noise_std(key, belief)` is the model's noise std [D]. A search knows nothing of the ones before: their values and
+    their curvature were another model's.
     """
-    optimizer = guarded(optax.lbfgs(memory_size=memory))
 
     def run(
         key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int
     ) -> tuple[Learner, SearchInfo]:
-        std = noise_std(key, belief)
+        value = partial(objective, belief=belief, std=noise_std(key, belief))
+
+        def idle(d: lbfgs.Descent) -> tuple[lbfgs.Descent, tuple[Array, Params]]:
+            return d, (d.value, optax.tree.get(d.state, "grad"))
+
+        def iterate(d: lbfgs.Descent, _: None) -> tuple[lbfgs.Descent, tuple[Array, Array]]:
+            d, (cost, gradient) = jax.lax.cond(d.failures < 2, partial(lbfgs.step, value), idle, d)
+            return d, (cost, optax.tree.norm(gradient))
+
         new = jnp.asarray(first) == 0
-        state = jax.tree.map(partial(jnp.where, new), optimizer.init(learner.params), learner.optimizer)
-        before = skipped(state)
+        descent = jax.tree.map(partial(jnp.where, new), lbfgs.begin(learner.params), learner.optimizer)
+        after, (values, norms) = jax.lax.scan(iterate, descent, None, steps)
+        return Learner(after.params, after), SearchInfo(values, norms, after.skipped - descent.skipped)
 
-        def value(params: Params) -> Array:
-            return objective(params, belief, std)
-
-        evaluate = optax.value_and_grad_from_state(value)
-
-        def iterate(learner: Learner, _: None) -> tuple[Learner, tuple[Array, Array]]:
-            params, state = learner
-            cost, gradient = evaluate(params, state=state)
-            updates, state = optimizer.update(gradient, state, params, value=cost, grad=gradient, value_fn=value)
-            return Learner(optax.apply_updates(params, updates), state), (cost, optax.tree.norm(gradient))
-
-        learner, (values, norms) = jax.lax.scan(iterate, Learner(learner.params, state), None, steps)
-        return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
-
-    return Searcher(optimizer.init, run, lambda key, params, belief: objective(params, belief, noise_std(key, belief)))
+    return Searcher(lbfgs.begin, run, lambda key, params, belief: objective(params, belief, noise_std(key, belief)))
