@@ -43,9 +43,8 @@ def process():
     noise = np.random.default_rng(1)
     inputs = noise.normal(size=(POINTS, F + 1))
     lengths, variance = noise.uniform(1.0, 2.5, size=(D, F + 1)), np.array([0.3, 0.5, 0.2])
-    inverse = np.stack(
-        [np.linalg.inv(v * se_kernel(inputs, inputs, s) + 1e-3 * np.eye(POINTS)) for s, v in zip(lengths, variance)]
-    )
+    grams = [v * se_kernel(inputs, inputs, s) for s, v in zip(lengths, variance, strict=True)]
+    inverse = np.linalg.inv(np.stack(grams) + 1e-3 * np.eye(POINTS))
     return inputs, np.einsum("enm,em->en", inverse, 0.3 * noise.normal(size=(D, POINTS))), inverse, lengths, variance
 
 

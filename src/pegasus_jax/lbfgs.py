@@ -10,7 +10,6 @@ import optax
 from pegasus_jax.fit import FitInfo
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Fitter, Key, Learner, Params
 
-
 MEMORY = 10  # past steps from which the curvature is known
 
 
