@@ -13,7 +13,10 @@ from pegasus_jax import config as settings
 from pegasus_jax.cost import of_particles
 from pegasus_jax.dynamics.bnn import HEADS, bnn
 from pegasus_jax.dynamics.ensemble import ensemble
+from pegasus_jax.dynamics.gp import gp
+from pegasus_jax.dynamics.ssgp import ssgp
 from pegasus_jax.fit import minibatches
+from pegasus_jax.lbfgs import full_data
 from pegasus_jax.policy.linear import linear
 from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.rbf import rbf
@@ -82,8 +85,10 @@ def limits(task: Task) -> tuple[Array, Array]:
     return jnp.asarray(task.control_low, float), jnp.asarray(task.control_high, float)
 
 
-def fit_of(config: settings.Fit, dynamics: Dynamics) -> Fitter:
+def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
     """The configured way of fitting a model."""
+    if isinstance(config, settings.LBFGS):
+        return full_data(dynamics, starts=config.starts)
     return minibatches(dynamics, optax.adam(config.learning_rate), batch=config.batch, reset=config.reset)
 
 
@@ -214,13 +219,23 @@ def start(key: Key, *, task: Task) -> Array:
     return mean + std * jax.random.normal(key, mean.shape)
 
 
-def dynamics_of(config: settings.BNN, task: Task) -> Dynamics:
+def dynamics_of(config: settings.BNN | settings.GP | settings.SSGP, task: Task) -> Dynamics:
     """The configured model of a task's dynamics."""
+    shape: dict[str, Any] = dict(states=len(task.state_names), controls=len(task.control_names), angles=task.angles)
+    match config:
+        case settings.GP():
+            return gp(**shape, features=config.features)
+        case settings.SSGP():
+            return ssgp(**shape, points=config.points)
+        case settings.BNN():
+            return network_of(config, shape)
+
+
+def network_of(config: settings.BNN, shape: dict[str, Any]) -> Dynamics:
+    """The configured network, or ensemble of networks."""
     noise = dropout_of(config)
     member = bnn(
-        states=len(task.state_names),
-        controls=len(task.control_names),
-        angles=task.angles,
+        **shape,
         hidden=config.hidden,
         dropout=noise,
         input_dropout=noise if config.input_noise else None,

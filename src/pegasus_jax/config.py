@@ -116,6 +116,32 @@ class BNN:
 
 
 @dataclass(frozen=True)
+class GP:
+    """Exact Gaussian-process dynamics."""
+
+    kind: str = setting("gp", "")
+    features: int = setting(200, "sines and cosines in a particle's function, before the data correct it")
+
+    def __post_init__(self) -> None:
+        _kind("model", self.kind, "gp")
+        _within("model.features", self.features, 2)
+        if self.features % 2:
+            raise SettingError(f"model.features={self.features} must be even; the nearest is {self.features + 1}")
+
+
+@dataclass(frozen=True)
+class SSGP:
+    """Sparse-spectrum Gaussian-process dynamics."""
+
+    kind: str = setting("ssgp", "")
+    points: int = setting(100, "frequencies of each dimension, a cosine and a sine each")
+
+    def __post_init__(self) -> None:
+        _kind("model", self.kind, "ssgp")
+        _within("model.points", self.points, 1)
+
+
+@dataclass(frozen=True)
 class MLP:
     """A ReLU network controller."""
 
@@ -178,6 +204,20 @@ class Fit:
         _within("fit.steps", self.steps, 1)
         _within("fit.batch", self.batch, 1)
         _within("fit.learning_rate", self.learning_rate, 0, open_low=True)
+
+
+@dataclass(frozen=True)
+class LBFGS:
+    """Model learning after each trial, by L-BFGS on all data."""
+
+    kind: str = setting("lbfgs", "")
+    steps: int = setting(300, "iterations a trial, at most")
+    starts: int = setting(100, "fresh parameters, of which the best, or the current ones, begin")
+
+    def __post_init__(self) -> None:
+        _kind("fit", self.kind, "lbfgs")
+        _within("fit.steps", self.steps, 1)
+        _within("fit.starts", self.starts, 1)
 
 
 @dataclass(frozen=True)
@@ -287,9 +327,9 @@ class Config:
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
     precision: str = setting("single", "of all numbers: single (32 bits) or double (64)")
-    model: BNN = BNN()
+    model: BNN | GP | SSGP = BNN()
     policy: MLP | RBF | Linear = MLP()
-    fit: Fit = Fit()
+    fit: Fit | LBFGS = Fit()
     search: Search | Analytic = Search()
     explore: Explore = Explore()
 
@@ -313,6 +353,9 @@ MODELS: dict[str, dict[str, Any]] = {
     "sparse": {"model": BNN(dropout="sparse")},
     "deterministic": {"model": BNN(dropout="none")},
     "ensemble": {"model": BNN(dropout="none", members=5)},
+    # The number of steps once more, because a task's own is meant for minibatches.
+    "gp": {"model": GP(), "fit": LBFGS(starts=10), "fit.steps": 300},
+    "ssgp": {"model": SSGP(), "fit": LBFGS(), "fit.steps": 300},
 }
 POLICIES: dict[str, dict[str, Any]] = {
     "dropout_mlp": {},
@@ -353,8 +396,8 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
 
 # What each section can be, by the kind that a stored config names.
 KINDS: dict[str, dict[str, Any]] = {
-    "model": {"bnn": BNN()},
+    "model": {"bnn": BNN(), "gp": GP(), "ssgp": SSGP()},
     "policy": {"mlp": MLP(), "rbf": RBF(), "linear": Linear()},
-    "fit": {"adam": Fit()},
+    "fit": {"adam": Fit(), "lbfgs": LBFGS()},
     "search": {"particles": Search(), "analytic": Analytic()},
 }

@@ -88,6 +88,7 @@ def gp(*, states: int, controls: int, angles: tuple[int, ...], features: int = 2
         return Prediction(unwhiten(scaling.targets, prior + update), h.noise * jnp.diagonal(scaling.targets.root))
 
     def moments(belief: Belief, mean: Array, cov: Array) -> gaussian.Image:
+        """PILCO's analytic moments. In float32 the means are good; the variances are not, and stop at 0."""
         h = belief.hyper
         process = partial(
             gaussian.rbf_moments,
@@ -97,7 +98,8 @@ def gp(*, states: int, controls: int, angles: tuple[int, ...], features: int = 2
             lengthscales=h.lengthscale,
             variance=h.signal**2,
         )
-        return kernel.in_raw_units(process, belief.scaling)(mean, cov)
+        image = kernel.in_raw_units(process, belief.scaling)(mean, cov)
+        return image._replace(cov=image.cov + jnp.diag(jnp.maximum(-jnp.diagonal(image.cov), 0)))
 
     return Dynamics(init, lambda data: kernel.rows_of(data, angles), loss, condition, sample, apply, moments)
 
