@@ -65,12 +65,12 @@ def compose(
         fit_steps=config.fit.steps,
         search=searcher,
         search_steps=config.search.steps,
-        search_reset=isinstance(config.search, settings.Search) and config.search.reset,
+        search_reset=config.search.reset,
         search_restart=config.search.restart,
         imagine=imagine,
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
-        mean_execution=isinstance(config.policy, settings.MLP) and config.policy.execution == "mean",
+        mean_execution=config.policy.execution == "mean",
         capacity=config.trials * task.horizon,
     )
 
@@ -145,10 +145,11 @@ def analytic_search_of(
             "algorithm=pilco needs a policy with analytic moments, saturated by sines: policy=rbf, policy=linear"
         )
     mean, std = jnp.asarray(task.start_mean, float), jnp.asarray(task.start_std, float)
+    low, high = limits(task)
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy)
 
     def noise_std(key: Key, belief: Params) -> Array:
-        middle = sum(limits(task)) / 2
+        middle = (low + high) / 2
         return dynamics.apply(belief, dynamics.sample(key, belief), mean, middle).std
 
     def value(params: Params, belief: Params, std: Array) -> Array:

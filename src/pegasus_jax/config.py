@@ -170,6 +170,7 @@ class RBF:
     kind: str = setting("rbf", "")
     units: int = setting(30, "radial basis functions")
     squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
+    execution = "mean"  # no setting: there is nothing to sample
 
     def __post_init__(self) -> None:
         _kind("policy", self.kind, "rbf")
@@ -183,6 +184,7 @@ class Linear:
 
     kind: str = setting("linear", "")
     squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
+    execution = "mean"  # no setting: there is nothing to sample
 
     def __post_init__(self) -> None:
         _kind("policy", self.kind, "linear")
@@ -291,6 +293,7 @@ class Analytic:
     policy_noise: float = setting(0.0, "factor of the model's noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the model's noise added to the state")
     cost_noise: float = setting(0.0, "factor of the model's noise on what the cost sees")
+    reset = True  # no setting: curvature is that of one model
 
     def __post_init__(self) -> None:
         _kind("search", self.kind, "analytic")

@@ -30,7 +30,7 @@ def begin(params: Params) -> Descent:
     return Descent(params, jnp.full((), jnp.inf), optax.lbfgs(memory_size=MEMORY).init(params), zero, zero, zero)
 
 
-def step(function: Callable[[Params], Array], d: Descent) -> tuple[Descent, tuple[Array, Params]]:
+def step(function: Callable[[Params], Array], d: Descent) -> tuple[Descent, tuple[Any, Params]]:
     """One iteration of L-BFGS with a zoom line search (Nocedal & Wright 2006, alg. 7.4 and 3.5).
 
     Also gives the value and the gradient where it began. The value never rises: a step that gains nothing, or ends

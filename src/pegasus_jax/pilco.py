@@ -73,8 +73,8 @@ def propagate(
     variance = jax.lax.stop_gradient(std) ** 2
 
     def advance(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], Gaussians]:
-        mean, cov, _ = one(*carry, policy_params, belief)
-        cov = cov + noise.state**2 * jnp.diag(variance)
+        image = one(*carry, policy_params, belief)
+        mean, cov = image.mean, image.cov + noise.state**2 * jnp.diag(variance)
         return (mean, cov, noise.policy**2 * variance), Gaussians(mean, cov)
 
     mean, cov = start
@@ -117,7 +117,10 @@ def analytic(
     def run(
         key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int
     ) -> tuple[Learner, SearchInfo]:
-        value = partial(objective, belief=belief, std=noise_std(key, belief))
+        std = noise_std(key, belief)
+
+        def value(params: Params) -> Array:
+            return objective(params, belief, std)
 
         def idle(d: lbfgs.Descent) -> tuple[lbfgs.Descent, tuple[Array, Params]]:
             return d, (d.value, optax.tree.get(d.state, "grad"))

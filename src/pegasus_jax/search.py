@@ -30,13 +30,13 @@ def remembering(optimizer: optax.GradientTransformation) -> optax.GradientTransf
     def init(params: Params) -> Remembering:
         return Remembering(optimizer.init(params), jnp.full((), jnp.inf), params)
 
-    def update(gradient: Params, state: Remembering, params: Params = None, *, value: Array, **extra: Any):
-        updates, inner = optimizer.update(gradient, state.inner_state, params, value=value, **extra)
+    def update(updates: Params, state: Any, params: Params = None, *, value: Array, **extra: Any) -> tuple[Params, Any]:
+        updates, inner = optimizer.update(updates, state.inner_state, params, value=value, **extra)
         better = value < state.best_value
         kept = jax.tree.map(partial(jnp.where, better), params, state.best_params)
         return updates, Remembering(inner, jnp.where(better, value, state.best_value), kept)
 
-    return optax.GradientTransformationExtraArgs(init, update)
+    return optax.GradientTransformationExtraArgs(init, update)  # type: ignore[arg-type]
 
 
 class SearchInfo(NamedTuple):
