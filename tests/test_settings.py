@@ -120,7 +120,9 @@ VARIANTS = [
 
 @pytest.mark.parametrize(("word", "variant"), VARIANTS)
 def test_a_variant_is_what_it_changes(word, variant):
-    assert parse(word) == dataclasses.replace(Config(), **variant)
+    sections = {name: change for name, change in variant.items() if "." not in name}
+    settled = {name: change for name, change in variant.items() if "." in name}
+    assert parse(word) == settings.override(dataclasses.replace(Config(), **sections), settled)
 
 
 def test_the_task_changes_only_what_the_chosen_variant_has():

@@ -66,8 +66,8 @@ def propagate(
     """H steps from the Gaussian `start` (mean [D], cov [D, D]); dynamics and policy must have `moments`.
 
     `std` [D] is that of the model's observation noise, which enters as in a rollout of particles: on what the policy
-    sees from the second step on, and, by the factor `noise.state`, on the state itself. Neither factor is in the
-    original: its model predicts the state without noise, and its policy sees that.
+    sees from the second step on, and, by the factor `noise.state`, on the state itself, independently. The original has
+    neither; the authors' sparse-spectrum model adds its noise to the state (its factor is 1, the policy's 0).
     """
     one = partial(step, dynamics=dynamics, policy=policy, angles=angles)
     variance = jax.lax.stop_gradient(std) ** 2
