@@ -17,7 +17,7 @@ from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
 from pegasus_jax.config import Config, SettingError, nearest
-from pegasus_jax.cost import saturating
+from pegasus_jax.cost import expected_saturating, saturating
 from pegasus_jax.types import Task
 
 
@@ -37,6 +37,7 @@ def of_plant(name: str, plant: Plant) -> Task:
         dt=plant.dt,
         state_names=plant.state_names,
         control_names=plant.control_names,
+        expected_cost=expected_saturating(plant.error, plant.width, plant.angles),
     )
 
 
