@@ -12,7 +12,7 @@ Aggregate = Callable[[Array], Array]  # costs [H, K] -> scalar
 
 
 def saturating(error: Callable[[Array], Array], width: float) -> Cost:
-    """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; reference settings 1.3)."""
+    """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; docs/reference.md 1.3)."""
 
     def cost(x: Array) -> Array:
         e = error(x) / width

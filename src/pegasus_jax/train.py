@@ -165,7 +165,7 @@ def one_trial(
 def evaluate(
     key: Key, state: RunState, task: Task, episode: Callable[..., Trajectory], episodes: int
 ) -> dict[str, float]:
-    """Mean cost a step and success rate over fresh episodes that are not data (reference settings 10)."""
+    """Mean cost a step and success rate over fresh episodes that are not data (docs/reference.md 10)."""
     follow = jnp.asarray(False)  # the policy, not random controls
     costs = np.stack(
         [np.asarray(episode(k, state.policy.params, follow).cost) for k in jax.random.split(key, episodes)]
