@@ -1,4 +1,4 @@
-"""Bayesian neural network dynamics: a network with multiplicative noise on its units (paper, section IV-C)."""
+"""Bayesian neural network dynamics: a network with multiplicative noise on its units (paper, sections IV-A and V-C)."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
