@@ -32,7 +32,7 @@ def mean(costs: Array) -> Array:
 
 
 def total(costs: Array) -> Array:
-    """Cost of an episode, averaged over particles: the paper's eq. 1 and Alg. 3 line 16."""
+    """Cost of an episode, averaged over particles: the paper's eq. 1 and Alg. 3 line 15."""
     return jnp.sum(jnp.mean(costs, 1))
 
 

@@ -27,7 +27,7 @@ def rollout(
     match: Callable[[Array, Array], Array],
     noise: NoiseUse = NoiseUse(),
 ) -> Rollout:
-    """Roll K particles out for H steps (Alg. 3 lines 6 to 15).
+    """Roll K particles out for H steps (Alg. 3 lines 6 to 14).
 
     Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match` is
     `moments.match` or `moments.keep`. No gradient flows through the predicted noise.

@@ -35,7 +35,7 @@ def objective(
     aggregate: Callable[[Array], Array] = costs.mean,
     noise: NoiseUse = NoiseUse(),
 ) -> Array:
-    """J(theta) (Alg. 3 line 16): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
+    """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
     imagined = rollout(policy_params, belief, scenarios, dynamics=dynamics, policy=policy, match=match, noise=noise)
     return aggregate(cost(imagined.seen))
 
@@ -52,7 +52,7 @@ def optimise(
     steps: int,
     first: Array | int = 0,
 ) -> tuple[Learner, SearchInfo]:
-    """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 20).
+    """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 19).
 
     One call of n steps and two calls of n/2, the second with first=n/2, do the same.
     """
