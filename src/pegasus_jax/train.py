@@ -155,7 +155,7 @@ def collected(
 def evaluate(
     keys: Key, params: Params, task: Task, episode: Callable[..., Trajectory], episodes: int
 ) -> list[dict[str, float]]:
-    """Mean cost a step and success rate of each seed [S], over fresh episodes that are not data."""
+    """Mean cost a step and success rate of each seed [S], over fresh episodes, not data (docs/reference.md 10)."""
     follow = jnp.asarray(False)  # the policy, not random controls
     each = jax.vmap(lambda key: jax.random.split(key, episodes), out_axes=1)(keys)
     costs = np.stack([np.asarray(fetched(episode(some, params, follow).cost)) for some in each], axis=1)  # [S, E, H]
