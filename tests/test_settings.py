@@ -118,13 +118,20 @@ VARIANTS = [
 
 @pytest.mark.parametrize(("word", "variant"), VARIANTS)
 def test_a_variant_is_what_it_changes(word, variant):
-    assert parse(word) == dataclasses.replace(Config(), **variant)
+    sections = {name: value for name, value in variant.items() if "." not in name}
+    expected = dataclasses.replace(Config(), **sections)
+    assert parse(word) == settings.override(expected, {k: v for k, v in variant.items() if k not in sections})
 
 
 def test_the_task_changes_only_what_the_chosen_variant_has():
     """The double cart-pole's networks are deeper; so are an ensemble's, and its members stay."""
     chosen = parse("task=double_cartpole", "model=ensemble")
     assert (chosen.model.hidden, chosen.model.members, chosen.model.dropout) == ((200,) * 4, 5, "none")
+
+
+def test_the_iterations_of_lbfgs_are_not_those_a_task_gives_its_minibatches():
+    assert parse("task=swimmer_knife_edge", "legs=6").fit.steps == 4000
+    assert parse("task=swimmer_knife_edge", "legs=6", "model=ssgp").fit.steps == 300
 
 
 @pytest.mark.parametrize("section", KINDS)
