@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax import config, cost, moments, scenarios, settings, types
+from pegasus_jax import config, cost, dataset, moments, scenarios, settings, types
 from pegasus_jax.build import AGGREGATES, EXPLORATIONS, build, compose, dropout_of, search_of, start
 from pegasus_jax.config import ALGORITHMS, DROPOUTS, MODELS, POLICIES, Config, Period, SettingError
 from pegasus_jax.dynamics.bnn import HEADS
@@ -59,6 +59,21 @@ def test_every_variant_has_the_shapes_of_the_loop(model, policy):
     assert jax.tree.structure(improved) == jax.tree.structure(state)
     shapes = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)] for tree in (improved, state)]
     assert shapes[0] == shapes[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "shape"),
+    [
+        ({"model": "gp", "model.features": "6"}, (2, 6)),
+        ({"model": "ssgp", "model.points": "4"}, (2, 8)),
+    ],
+)
+def test_the_size_of_a_gaussian_process_is_the_one_given(words, shape):
+    dynamics = compose(settings.parse(words), cart()).dynamics
+    data = jax.eval_shape(lambda: dataset.empty(9, 2, 1))
+    belief = jax.eval_shape(dynamics.condition, jax.eval_shape(dynamics.init, jax.random.key(0)), data)
+    draw = jax.eval_shape(dynamics.sample, jax.random.key(0), belief)
+    assert shape in [leaf.shape for leaf in jax.tree.leaves(draw)]
 
 
 @pytest.mark.parametrize("algorithm", sorted({*ALGORITHMS} - {"pilco"}))

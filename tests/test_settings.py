@@ -131,6 +131,11 @@ def test_the_task_changes_only_what_the_chosen_variant_has():
     assert (chosen.model.hidden, chosen.model.members, chosen.model.dropout) == ((200,) * 4, 5, "none")
 
 
+def test_the_iterations_of_lbfgs_are_not_those_a_task_gives_its_minibatches():
+    assert parse("task=swimmer_knife_edge", "legs=6").fit.steps == 4000
+    assert parse("task=swimmer_knife_edge", "legs=6", "model=ssgp").fit.steps == 300
+
+
 @pytest.mark.parametrize("section", KINDS)
 def test_the_kind_of_a_section_is_not_a_setting(section):
     with pytest.raises(SettingError, match=rf"{section}\.kind=other.*(model|policy|algorithm)="):

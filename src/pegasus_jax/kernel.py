@@ -7,8 +7,11 @@ length scale of 1 is the standard deviation of the data.
 from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.custom_batching import custom_vmap
+from jax.scipy.linalg import solve_triangular
 
 from pegasus_jax import gaussian
 from pegasus_jax.angles import encode
@@ -105,6 +108,25 @@ def squared_distance(a: Array, b: Array) -> Array:
 def waves(phase: Array) -> Array:
     """Trigonometric features [..., 2m] of phases [..., m]: all cosines, then all sines."""
     return jnp.concatenate([jnp.cos(phase), jnp.sin(phase)], -1)
+
+
+@custom_vmap
+def inverse_root(matrix: Array) -> Array:
+    """The inverse of the lower Cholesky factor of a positive definite matrix [N, N]; NaN if it is not.
+
+    Many matrices are taken one after the other on a CPU: jaxlib 0.10 spreads a batch over the threads that run the
+    program, waits for them in one of them, and now and then waits for ever. Not to be differentiated: the evidences
+    know their gradients.
+    """
+    factor = jnp.linalg.cholesky(matrix)
+    return solve_triangular(factor, jnp.eye(matrix.shape[0], dtype=matrix.dtype), lower=True)
+
+
+@inverse_root.def_vmap
+def _(axis_size: int, in_batched: list[bool], matrices: Array) -> tuple[Array, bool]:
+    del axis_size, in_batched
+    whole = jax.vmap(inverse_root.fun)
+    return jax.lax.platform_dependent(matrices, cpu=partial(jax.lax.map, inverse_root), default=whole), True
 
 
 def in_raw_units(process: gaussian.Map, scaling: Scaling) -> gaussian.Map:

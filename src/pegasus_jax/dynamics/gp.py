@@ -6,7 +6,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_solve, solve_triangular
 
 from pegasus_jax import gaussian, kernel
 from pegasus_jax.kernel import Hyper, Rows, Scaling
@@ -21,7 +20,7 @@ class Belief(NamedTuple):
     x: Array  # [N, F]
     y: Array  # [E, N]
     used: Array  # [N] bool
-    factor: Array  # [E, N, N] lower Cholesky factor of the kernel matrix with noise
+    root: Array  # [E, N, N] inverse of the lower Cholesky factor of the kernel matrix with noise
     beta: Array  # [E, N] inverse @ y
     inverse: Array  # [E, N, N] of the kernel matrix with noise; zero where a row is not in use
     scaling: Scaling
@@ -60,14 +59,9 @@ def gp(*, states: int, controls: int, angles: tuple[int, ...], features: int = 2
 
     def condition(params: Params, data: Dataset) -> Belief:
         h, rows = kernel.hyper(params), kernel.rows_of(data, angles)
-        factor = jnp.linalg.cholesky(gram(h, rows.x, rows.used))
-        eye = jnp.eye(rows.x.shape[0], dtype=rows.x.dtype)
-        root = jax.vmap(partial(solve_triangular, b=eye, lower=True))(factor)  # [E, N, N] inverse of the factor
-        both = rows.used[:, None] & rows.used
-        return Belief(
-            h, rows.x, rows.y, rows.used, factor, solve(factor, rows.y),
-            jnp.where(both, jnp.swapaxes(root, 1, 2) @ root, 0), rows.scaling,
-        )  # fmt: skip
+        root = jax.vmap(kernel.inverse_root)(gram(h, rows.x, rows.used))
+        inverse = jnp.where(rows.used[:, None] & rows.used, jnp.swapaxes(root, 1, 2) @ root, 0)
+        return Belief(h, rows.x, rows.y, rows.used, root, solve(root, rows.y), inverse, rows.scaling)
 
     def sample(key: Key, belief: Belief) -> Draw:
         h, dtype = belief.hyper, belief.x.dtype
@@ -78,7 +72,7 @@ def gp(*, states: int, controls: int, angles: tuple[int, ...], features: int = 2
         # One output after the other: with many particles the features of all rows at once would fill the memory.
         prior = jax.lax.map(lambda wave: kernel.waves(belief.x @ wave[0].T) @ wave[1], (frequencies, weights))
         misfit = jnp.where(belief.used, belief.y - prior - noise, 0)
-        return Draw(frequencies, weights, solve(belief.factor, misfit))
+        return Draw(frequencies, weights, solve(belief.root, misfit))
 
     def apply(belief: Belief, draw: Draw, x: Array, u: Array) -> Prediction:
         h, scaling = belief.hyper, belief.scaling
@@ -122,14 +116,23 @@ def cross(h: Hyper, z: Array, x: Array) -> Array:
     return h.signal[:, None] ** 2 * jnp.exp(-0.5 * distance)
 
 
-def solve(factor: Array, y: Array) -> Array:
-    """(factor factor')^-1 y for each output: factor [E, N, N], y [E, N]."""
-    return jax.vmap(lambda f, b: cho_solve((f, True), b))(factor, y)
+def solve(root: Array, y: Array) -> Array:
+    """(root' root) y for each output: root [E, N, N], y [E, N]."""
+    return jnp.einsum("eji,ej->ei", root, jnp.einsum("eij,ej->ei", root, y))
 
 
 def log_evidence(h: Hyper, rows: Rows) -> Array:
-    """log p(y | x) of the scaled targets of each output [E] (Rasmussen & Williams 2006, eq. 2.30)."""
-    factor = jnp.linalg.cholesky(gram(h, rows.x, rows.used))
-    white = jax.vmap(partial(solve_triangular, lower=True))(factor, rows.y)
-    log_det = jnp.sum(jnp.log(jnp.diagonal(factor, axis1=1, axis2=2)), -1)
-    return -0.5 * jnp.sum(white**2, -1) - log_det - 0.5 * rows.size * np.log(2 * np.pi)
+    """log p(y | x) of the scaled targets of each output [E] (Rasmussen & Williams 2006, eq. 2.30).
+
+    Its derivative by the kernel matrix (eq. 5.9) is written down, not left to the derivative of a Cholesky factor: a
+    product that is zero carries it.
+    """
+    k = gram(h, rows.x, rows.used)
+    held = jax.lax.stop_gradient(k)
+    root = jax.vmap(kernel.inverse_root)(held)
+    white = jnp.einsum("eij,ej->ei", root, rows.y)
+    beta = jnp.einsum("eji,ej->ei", root, white)
+    half_log_det = -jnp.sum(jnp.log(jnp.diagonal(root, axis1=1, axis2=2)), -1)
+    slope = 0.5 * (beta[:, :, None] * beta[:, None, :] - jnp.swapaxes(root, 1, 2) @ root)
+    value = -0.5 * jnp.sum(white**2, -1) - half_log_det - 0.5 * rows.size * np.log(2 * np.pi)
+    return value + jnp.sum(slope * (k - held), (1, 2))

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.linalg import cho_solve, solve_triangular
 
 from pegasus_jax import gaussian, kernel
 from pegasus_jax.kernel import Rows, Scaling
@@ -86,25 +85,21 @@ def ssgp(*, states: int, controls: int, angles: tuple[int, ...], points: int = 1
 
 
 def design(frequencies: Array, signal: Array, noise: Array, rows: Rows) -> tuple[Array, Array]:
-    """Features [N, 2m] of standard normal weights in units of the noise, and the Cholesky factor of their precision.
+    """Features [N, 2m] of standard normal weights in units of the noise, and the weights' posterior precision.
 
     The precision, I + features' features, has no eigenvalue below 1.
     """
     scale = signal / noise / frequencies.shape[0] ** 0.5
     features = jnp.where(rows.used[:, None], scale * kernel.waves(rows.x @ frequencies.T), 0)
-    precision = features.T @ features
-    return features, jnp.linalg.cholesky(precision + jnp.eye(precision.shape[0], dtype=precision.dtype))
+    return features, features.T @ features + jnp.eye(features.shape[1], dtype=features.dtype)
 
 
 def posterior(frequencies: Array, signal: Array, noise: Array, y: Array, rows: Rows) -> Posterior:
     """The weights of one output, of frequencies [m, F] and targets y [N]."""
-    features, factor = design(frequencies, signal, noise, rows)
+    features, precision = design(frequencies, signal, noise, rows)
     scale = signal / frequencies.shape[0] ** 0.5
-    eye = jnp.eye(factor.shape[0], dtype=factor.dtype)
-    return Posterior(
-        scale * cho_solve((factor, True), features.T @ (y / noise)),
-        scale * solve_triangular(factor, eye, trans=1, lower=True),
-    )
+    root = kernel.inverse_root(precision)
+    return Posterior(scale * (root.T @ (root @ (features.T @ (y / noise)))), scale * root.T)
 
 
 def log_evidence(frequencies: Array, signal: Array, noise: Array, y: Array, rows: Rows) -> Array:
@@ -112,11 +107,14 @@ def log_evidence(frequencies: Array, signal: Array, noise: Array, y: Array, rows
 
     The quadratic form y' (noise^2 I + features features')^-1 y is taken as the least penalised square error: a sum of
     squares, where the usual difference cancels all digits when the noise is low. At its minimum the weights' own
-    dependence on the hyperparameters is of no account, so no gradient need flow through their solution.
+    dependence on the hyperparameters is of no account, so no gradient need flow through their solution; and that of
+    the determinant is written down, carried by a product that is zero.
     """
-    features, factor = design(frequencies, signal, noise, rows)
+    features, precision = design(frequencies, signal, noise, rows)
+    held = jax.lax.stop_gradient(precision)
+    root = kernel.inverse_root(held)
     white = y / noise
-    weights = jax.lax.stop_gradient(cho_solve((factor, True), features.T @ white))
+    weights = jax.lax.stop_gradient(root.T @ (root @ (features.T @ white)))
     quadratic = jnp.sum((white - features @ weights) ** 2) + jnp.sum(weights**2)
-    log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(factor))) + rows.size * jnp.log(2 * np.pi * noise**2)
-    return -0.5 * (quadratic + log_det)
+    log_det = jnp.sum((root.T @ root) * (precision - held)) - 2 * jnp.sum(jnp.log(jnp.diagonal(root)))
+    return -0.5 * (quadratic + log_det + rows.size * jnp.log(2 * np.pi * noise**2))
