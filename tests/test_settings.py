@@ -156,7 +156,7 @@ def test_a_variant_brings_defaults_that_single_settings_change():
 
 
 def test_the_paper_is_a_variant():
-    """Alg. 3 and reference settings 1.2, 4.7, 5.2, 5.5: all draws but the start held for the whole search."""
+    """Alg. 3 and docs/reference.md 1.2, 4.7, 5.2, 5.5: all draws but the start held for the whole search."""
     chosen = parse("algorithm=paper")
     assert chosen.search.period == Period(start=1, dynamics=0, policy=0, sensor=0, match=0)
     assert (chosen.model.activation, chosen.model.kl_weight, chosen.fit.learning_rate) == ("relu", 1.0, 1e-4)

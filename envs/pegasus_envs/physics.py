@@ -74,8 +74,10 @@ def _compiled(name: str) -> mujoco.MjModel:
 @cache
 def _on_device(name: str, x64: bool) -> tuple[Any, Any]:
     del x64  # part of the cache's key only: the arrays have that precision
+    here = jax.local_devices()[0]  # MJX would choose the first of all, which may be another process's
     with jax.ensure_compile_time_eval():  # so that a plant may be built inside jit, and still be cached
-        return mjx.put_model(_compiled(name), impl="jax"), mjx.make_data(_compiled(name), impl="jax")
+        compiled = _compiled(name)
+        return mjx.put_model(compiled, here, impl="jax"), mjx.make_data(compiled, here, impl="jax")
 
 
 def load(name: str, changes: Iterable[Change] = ()) -> Physics:

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 
 from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco, scenarios, tasks, trial
 from pegasus_jax import config as settings
@@ -17,6 +18,7 @@ from pegasus_jax.dynamics.gp import gp
 from pegasus_jax.dynamics.ssgp import ssgp
 from pegasus_jax.fit import minibatches
 from pegasus_jax.lbfgs import full_data
+from pegasus_jax.mesh import Spread, over_particles, together
 from pegasus_jax.policy.linear import linear
 from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.rbf import rbf
@@ -43,18 +45,25 @@ EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 
 
 @lru_cache(maxsize=64)
-def build(config: settings.Config) -> Experiment:
+def build(config: settings.Config, mesh: Mesh | None = None) -> Experiment:
     """The experiment of a config. Cached: the same config gives the same functions, which compile once."""
-    return compose(config, tasks.of_config(config))
+    return compose(config, tasks.of_config(config), mesh=mesh)
 
 
 def compose(
-    config: settings.Config, task: Task, dynamics: Dynamics | None = None, policy: Policy | None = None
+    config: settings.Config,
+    task: Task,
+    dynamics: Dynamics | None = None,
+    policy: Policy | None = None,
+    mesh: Mesh | None = None,
 ) -> Experiment:
-    """The experiment of a config on any task; a model or policy of your own takes the configured one's place."""
+    """The experiment of a config on any task; a model or policy of your own takes the configured one's place.
+
+    With a `mesh` (mesh.py) the particles of a search are spread over its devices.
+    """
     dynamics = dynamics or dynamics_of(config.model, task)
     policy = policy or policy_of(config.policy, task)
-    searcher, imagine = search_of(config.search, task, dynamics, policy)
+    searcher, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)
     explore = config.explore
     return trial.experiment(
@@ -96,7 +105,11 @@ Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]  # (key, policy
 
 
 def search_of(
-    search: settings.Search | settings.Analytic, task: Task, dynamics: Dynamics, policy: Policy
+    search: settings.Search | settings.Analytic,
+    task: Task,
+    dynamics: Dynamics,
+    policy: Policy,
+    spread: Spread = together,
 ) -> tuple[Searcher, Imagine]:
     """The configured way of improving a policy, and fresh imagined rollouts of the same kind."""
     aggregate = AGGREGATES[search.aggregate]
@@ -110,7 +123,7 @@ def search_of(
         )
     if search.risk < 1:
         aggregate = cost.worst(search.risk, aggregate)
-    blocks = blocks_of(search.particles, task, dynamics, policy, balanced=search.balanced)
+    blocks = blocks_of(search.particles, task, dynamics, policy, balanced=search.balanced, spread=spread)
     pieces: dict[str, Any] = dict(
         dynamics=dynamics, policy=policy, match=moments.match if search.match else moments.keep, noise=noise
     )
@@ -187,7 +200,12 @@ def discounted(search: settings.Search | settings.Analytic, aggregate: cost.Aggr
 
 
 def blocks_of(
-    particles: int, task: Task, dynamics: Dynamics, policy: Policy, balanced: bool = False
+    particles: int,
+    task: Task,
+    dynamics: Dynamics,
+    policy: Policy,
+    balanced: bool = False,
+    spread: Spread = together,
 ) -> scenarios.Blocks:
     """How the scenarios of a task's imagined rollouts are drawn."""
     return scenarios.blocks(
@@ -197,6 +215,7 @@ def blocks_of(
         particles=particles,
         horizon=task.horizon,
         balanced=balanced,
+        spread=spread,
     )
 
 

@@ -17,7 +17,7 @@ Aggregate = Callable[[Array], Array]  # costs [H, K] -> scalar
 
 
 def saturating(error: Error, width: float) -> Cost:
-    """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; reference settings 1.3)."""
+    """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; docs/reference.md 1.3)."""
 
     def cost(x: Array) -> Array:
         e = error(x) / width
@@ -43,7 +43,7 @@ def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Ar
 
 
 def expected_saturating(error: Error, width: float, angles: tuple[int, ...]) -> Expected:
-    """The expectation of `saturating(error, width)` of a Gaussian state, as PILCO has it (reference settings 1.3).
+    """The expectation of `saturating(error, width)` of a Gaussian state, as PILCO has it (docs/reference.md 1.3).
 
     The features of the state are taken for Gaussian, with their exact moments: exact without angles, and as close as
     that is with them.
@@ -73,7 +73,7 @@ def mean(costs: Array) -> Array:
 
 
 def total(costs: Array) -> Array:
-    """Cost of an episode, averaged over particles: the paper's eq. 1 and Alg. 3 line 16."""
+    """Cost of an episode, averaged over particles: the paper's eq. 1 and Alg. 3 line 15."""
     return jnp.sum(jnp.mean(costs, 1))
 
 

@@ -10,7 +10,7 @@ from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenario
 
 
 class NoiseUse(NamedTuple):
-    """Where the model's predicted observation noise enters a rollout, as factors of it (reference settings 5.4)."""
+    """Where the model's predicted observation noise enters a rollout, as factors of it (docs/reference.md 5.4)."""
 
     policy: float = 1.0  # the policy sees x_t + factor * std_t * noise_t
     state: float = 0.0  # the state itself moves by factor * std * noise
@@ -28,7 +28,7 @@ def rollout(
     noise: NoiseUse = NoiseUse(),
     truncate: int | None = None,
 ) -> Rollout:
-    """Roll K particles out for H steps (Alg. 3 lines 6 to 15).
+    """Roll K particles out for H steps (Alg. 3 lines 6 to 14).
 
     Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match` is
     `moments.match` or `moments.keep`. No gradient flows through the predicted noise, nor, with `truncate`, through

@@ -60,7 +60,7 @@ def objective(
     noise: NoiseUse = NoiseUse(),
     truncate: int | None = None,
 ) -> Array:
-    """J(theta) (Alg. 3 line 16): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
+    """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
     imagined = rollout(
         policy_params,
         belief,
@@ -86,7 +86,7 @@ def optimise(
     steps: int,
     first: Array | int = 0,
 ) -> tuple[Learner, SearchInfo]:
-    """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 20).
+    """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 19).
 
     One call of n steps and two calls of n/2, the second with first=n/2, do the same.
     """

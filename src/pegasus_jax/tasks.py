@@ -51,7 +51,7 @@ TASKS: dict[str, Callable[[Any], Plant]] = {
 GYM = "gym"  # the task that `env=` and `cost=` describe
 NAMES = (*TASKS, GYM)
 
-# Reference settings 2.2; the paper's networks and step size.
+# docs/reference.md 2.2; the paper's networks and step size.
 _DOUBLE_CARTPOLE: dict[str, Any] = {
     "trials": 40,
     "model.hidden": (200,) * 4,
@@ -60,7 +60,7 @@ _DOUBLE_CARTPOLE: dict[str, Any] = {
     "explore.trials": 2,
 }
 
-# Reference settings 3.4; what the legs do not change. The policy's dropout is the paper's .1, as everywhere.
+# docs/reference.md 3.4; what the legs do not change. The policy's dropout is the paper's .1, as everywhere.
 _SWIMMER: dict[str, Any] = {
     "trials": 50,
     "model.hidden": (200,) * 4,

@@ -10,7 +10,7 @@ from pegasus_jax.gaussian import Image, Map, chain, rbf_moments
 from pegasus_jax.types import Array, Key, Params, Policy
 
 # Variance of the targets' noise, for a signal of variance 1; both fixed. The originals' .01 is a standard deviation
-# (reference settings 5.1), which makes weights of thousands that cancel: more than float32 can hold, and no better.
+# (docs/reference.md 5.1), which makes weights of thousands that cancel: more than float32 can hold, and no better.
 NOISE = 0.01
 
 
@@ -24,7 +24,7 @@ def rbf(
     saturate: Callable[[Array], Array],
     saturate_moments: Map | None,
 ) -> Policy:
-    """u = saturate(k(encode(x), centres) beta) with beta = (K + noise I)^-1 targets (reference settings 5.1).
+    """u = saturate(k(encode(x), centres) beta) with beta = (K + noise I)^-1 targets (docs/reference.md 5.1).
 
     Every control has targets and length scales of its own; the centres are shared. `start` draws the states at which
     the centres begin, the last `waves` features of `encode` are sines and cosines. `saturate_moments` is the moment
