@@ -49,8 +49,7 @@ def test_every_dropout_is_the_one_of_its_name(kind):
 @pytest.mark.parametrize("policy", POLICIES)
 def test_every_variant_has_the_shapes_of_the_loop(model, policy):
     """eval_shape traces the loop without compiling it."""
-    chosen = dataclasses.replace(tiny(), model=MODELS[model], policy=POLICIES[policy])
-    exp = compose(chosen, dial())
+    exp = compose(settings.parse({"model": model, "policy": policy}), dial())
     state = jax.eval_shape(exp.init, jax.random.key(0))
     state = jax.eval_shape(exp.absorb, state, jax.eval_shape(exp.collect, state))
     improved, _ = jax.eval_shape(exp.improve, state)

@@ -13,6 +13,7 @@ from pegasus_jax.build import compose
 from pegasus_jax.config import (
     ALGORITHMS,
     BNN,
+    KINDS,
     MLP,
     MODELS,
     POLICIES,
@@ -105,19 +106,40 @@ def test_every_setting_has_a_spelling():
     text = "\n".join(settings.help_lines(Config()))
     for key, default in settings.leaves(Config()).items():
         assert parse(f"{key}={settings._text(default)}") == Config()
-        if key != "task":
+        if key not in ("task", *(f"{section}.kind" for section in KINDS)):
             assert f"  {key}={settings._text(default)} " in text
 
 
 VARIANTS = [
-    *((f"model={name}", "model", variant) for name, variant in MODELS.items()),
-    *((f"policy={name}", "policy", variant) for name, variant in POLICIES.items()),
+    *((f"model={name}", variant) for name, variant in MODELS.items()),
+    *((f"policy={name}", variant) for name, variant in POLICIES.items()),
 ]
 
 
-@pytest.mark.parametrize(("word", "section", "variant"), VARIANTS)
-def test_a_variant_is_its_section(word, section, variant):
-    assert parse(word) == dataclasses.replace(Config(), **{section: variant})
+@pytest.mark.parametrize(("word", "variant"), VARIANTS)
+def test_a_variant_is_what_it_changes(word, variant):
+    assert parse(word) == dataclasses.replace(Config(), **variant)
+
+
+def test_the_task_changes_only_what_the_chosen_variant_has():
+    """The double cart-pole's networks are deeper; so are an ensemble's, and its members stay."""
+    chosen = parse("task=double_cartpole", "model=ensemble")
+    assert (chosen.model.hidden, chosen.model.members, chosen.model.dropout) == ((200,) * 4, 5, "none")
+
+
+@pytest.mark.parametrize("section", KINDS)
+def test_the_kind_of_a_section_is_not_a_setting(section):
+    with pytest.raises(SettingError, match=rf"{section}\.kind=other.*(model|policy|algorithm)="):
+        parse(f"{section}.kind=other")
+
+
+@pytest.mark.parametrize("section", KINDS)
+def test_a_stored_kind_that_is_unknown_is_named(section, tmp_path):
+    path = tmp_path / "config.yaml"
+    settings.save(Config(), path)
+    path.write_text(path.read_text().replace(f"{section}.kind: ", f"{section}.kind: un"), encoding="utf-8")
+    with pytest.raises(SettingError, match=rf"{section}\.kind=un.*is unknown"):
+        settings.load(path)
 
 
 def test_a_variant_brings_defaults_that_single_settings_change():

@@ -51,6 +51,14 @@ def _layers(name: str, value: Any) -> tuple[int, ...]:
     return layers
 
 
+def _kind(section: str, value: str, kind: str) -> None:
+    """A section's kind says which class it is; a variant changes it, never a single setting."""
+    if value != kind:
+        raise SettingError(
+            f"{section}.kind={value} cannot be set: model=, policy= and algorithm= choose what {section} is"
+        )
+
+
 def setting(default: Any, text: str) -> Any:
     """A field with its help text."""
     return field(default=default, metadata={"help": text})
@@ -65,12 +73,15 @@ EXPLORATIONS = ("uniform", "walk")
 AGGREGATES = ("mean", "total")
 EXECUTIONS = ("sampled", "mean")
 LEGS = (2, 6)
+PRECISIONS = ("single", "double")
 
 
 @dataclass(frozen=True)
 class BNN:
-    """Bayesian neural network dynamics."""
+    """Bayesian neural network dynamics, or an ensemble of them."""
 
+    kind: str = setting("bnn", "")
+    members: int = setting(1, "networks fitted side by side; each particle follows one of them")
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
     rate: float = setting(0.1, "drop probability of binary dropout, initial one of concrete dropout")
@@ -86,6 +97,8 @@ class BNN:
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
+        _kind("model", self.kind, "bnn")
+        _within("model.members", self.members, 1)
         object.__setattr__(self, "hidden", _layers("model.hidden", self.hidden))
         _choice("model.activation", self.activation, ACTIVATIONS)
         _within("model.kl_weight", self.kl_weight, 0)
@@ -105,6 +118,7 @@ class BNN:
 class MLP:
     """A ReLU network controller."""
 
+    kind: str = setting("mlp", "")
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: float = setting(0.1, "drop probability of the hidden units; 0 is a deterministic policy")
     squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
@@ -113,6 +127,7 @@ class MLP:
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
+        _kind("policy", self.kind, "mlp")
         object.__setattr__(self, "hidden", _layers("policy.hidden", self.hidden))
         _choice("policy.squash", self.squash, SQUASHES)
         _choice("policy.execution", self.execution, EXECUTIONS)
@@ -123,14 +138,16 @@ class MLP:
 
 @dataclass(frozen=True)
 class Fit:
-    """Model learning after each trial."""
+    """Model learning after each trial, by Adam on minibatches."""
 
+    kind: str = setting("adam", "")
     steps: int = setting(2000, "updates a trial")
     batch: int = setting(100, "rows an update")
     learning_rate: float = setting(3e-4, "Adam's step size")
     reset: bool = setting(False, "forget Adam's moments at each trial")
 
     def __post_init__(self) -> None:
+        _kind("fit", self.kind, "adam")
         _within("fit.steps", self.steps, 1)
         _within("fit.batch", self.batch, 1)
         _within("fit.learning_rate", self.learning_rate, 0, open_low=True)
@@ -153,8 +170,9 @@ class Period:
 
 @dataclass(frozen=True)
 class Search:
-    """Policy search after each fit."""
+    """Policy search after each fit, along the gradient of imagined rollouts of particles."""
 
+    kind: str = setting("particles", "")
     steps: int = setting(1000, "iterations a trial")
     particles: int = setting(100, "K, imagined rollouts an iteration")
     learning_rate: float = setting(1e-3, "Adam's step size")
@@ -171,6 +189,7 @@ class Search:
     period: Period = Period()
 
     def __post_init__(self) -> None:
+        _kind("search", self.kind, "particles")
         _within("search.steps", self.steps, 1)
         _within("search.particles", self.particles, 2)
         _within("search.learning_rate", self.learning_rate, 0, open_low=True)
@@ -206,6 +225,7 @@ class Config:
     horizon: int | None = setting(None, "of task=gym: control periods an episode; null: the environment's own limit")
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
+    precision: str = setting("single", "of all numbers: single (32 bits) or double (64)")
     model: BNN = BNN()
     policy: MLP = MLP()
     fit: Fit = Fit()
@@ -214,6 +234,7 @@ class Config:
 
     def __post_init__(self) -> None:
         _choice("legs", self.legs, LEGS)
+        _choice("precision", self.precision, PRECISIONS)
         object.__setattr__(self, "angles", tuple(self.angles))
         if self.horizon is not None:
             _within("horizon", self.horizon, 1)
@@ -221,18 +242,20 @@ class Config:
         _within("trials", self.trials, 1, 10_000)
 
 
-# The named variants that `model=`, `policy=` and `algorithm=` select.
-MODELS: dict[str, BNN] = {
-    "log_normal": BNN(),
-    "binary": BNN(dropout="binary"),
-    "concrete": BNN(dropout="concrete"),
-    "gaussian": BNN(dropout="gaussian"),
-    "sparse": BNN(dropout="sparse"),
-    "deterministic": BNN(dropout="none"),
+# The named variants that `model=`, `policy=` and `algorithm=` select: what each changes in the defaults, whole sections
+# first. A dotted change counts only where the chosen sections have such a setting.
+MODELS: dict[str, dict[str, Any]] = {
+    "log_normal": {},
+    "binary": {"model": BNN(dropout="binary")},
+    "concrete": {"model": BNN(dropout="concrete")},
+    "gaussian": {"model": BNN(dropout="gaussian")},
+    "sparse": {"model": BNN(dropout="sparse")},
+    "deterministic": {"model": BNN(dropout="none")},
+    "ensemble": {"model": BNN(dropout="none", members=5)},
 }
-POLICIES: dict[str, MLP] = {
-    "dropout_mlp": MLP(),
-    "mlp": MLP(dropout=0.0),
+POLICIES: dict[str, dict[str, Any]] = {
+    "dropout_mlp": {},
+    "mlp": {"policy": MLP(dropout=0.0)},
 }
 ALGORITHMS: dict[str, dict[str, Any]] = {
     "pegasus": {},  # the defaults: what learned best (docs/decisions/0001)
@@ -240,7 +263,11 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
         "model.activation": "relu",
         "model.kl_weight": 1.0,
         "fit.learning_rate": 1e-4,
-        "search.period": {"start": 1, "dynamics": 0, "policy": 0, "sensor": 0, "match": 0},
+        "search.period.start": 1,
+        "search.period.dynamics": 0,
+        "search.period.policy": 0,
+        "search.period.sensor": 0,
+        "search.period.match": 0,
         "search.reset": False,
         "search.restart": False,
     },
@@ -251,6 +278,18 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
         "search.restart": False,
         "search.particles": 10,
         "search.clip": None,
-        "search.period": {"start": 1, "dynamics": 1, "policy": 1, "sensor": 1, "match": 1},
+        "search.period.start": 1,
+        "search.period.dynamics": 1,
+        "search.period.policy": 1,
+        "search.period.sensor": 1,
+        "search.period.match": 1,
     },
+}
+
+# What each section can be, by the kind that a stored config names.
+KINDS: dict[str, dict[str, Any]] = {
+    "model": {"bnn": BNN()},
+    "policy": {"mlp": MLP()},
+    "fit": {"adam": Fit()},
+    "search": {"particles": Search()},
 }

@@ -24,7 +24,7 @@ def watch(
     assert task.plant is not None, f"task {task.name} has no simulated plant"
     plant = task.plant
     begin, first, steps = jax.random.split(key, 3)
-    sensor_std = jnp.asarray(task.sensor_std, jnp.float32)
+    sensor_std = jnp.asarray(task.sensor_std, float)
 
     def measure(key: Key, state: object) -> Array:
         x = plant.observe(state)

@@ -1,16 +1,18 @@
 """Policy search: follow the gradient of the imagined cost under held scenarios (Alg. 3)."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from pegasus_jax import cost as costs
-from pegasus_jax.fit import skipped
+from pegasus_jax.fit import guarded, skipped
 from pegasus_jax.rollout import NoiseUse, rollout
-from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Policy, Scenarios
+from pegasus_jax.scenarios import Blocks, draw, redraw
+from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Period, Policy, Scenarios, Searcher
 
 
 class SearchInfo(NamedTuple):
@@ -68,3 +70,25 @@ def optimise(
     scenarios = draw(key, first, belief)
     (learner, _), (values, norms) = jax.lax.scan(step, (learner, scenarios), first + jnp.arange(steps))
     return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
+
+
+def particles(
+    objective: Callable[[Params, Params, Scenarios], Array],
+    optimizer: optax.GradientTransformation,
+    *,
+    blocks: Blocks,
+    period: Period,
+) -> Searcher:
+    """The searcher that follows the gradient of `objective` under scenarios drawn from `blocks`, held for `period`."""
+    optimizer = guarded(optimizer)
+    pieces: dict[str, Any] = dict(
+        draw=partial(draw, blocks=blocks, period=period),
+        redraw=partial(redraw, blocks=blocks, period=period),
+        objective=objective,
+        optimizer=optimizer,
+    )
+    return Searcher(
+        init=optimizer.init,
+        run=partial(optimise, **pieces),
+        value=lambda key, params, belief: objective(params, belief, pieces["draw"](key, 0, belief)),
+    )
