@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+
 class Limbs(NamedTuple):
     """Degrees of freedom of a trunk, and of chains that grow from it and move independently of each other."""
 
