@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.in_c import in_c
 from envs import references
 from envs.references import simulated
 from pegasus_envs import physics
@@ -25,7 +26,7 @@ def errors(system, seed: int) -> tuple[np.ndarray, np.ndarray]:
     state, controls = system.plant.place(system.plant.start_mean.astype(np.float32)), system.random(seed)
     xs = np.asarray(system.run(state, controls), float)
     exact = references.integrate(RATES[xs.shape[1]], xs[0], controls)
-    qpos, qvel, _ = references.in_c(system.plant, state.qpos, state.qvel, controls)
+    qpos, qvel, _ = in_c(system.plant, state.qpos, state.qvel, controls)
     c = np.stack([system.plant.observe(physics.Motion(q, v)) for q, v in zip(qpos, qvel, strict=True)])
     return np.abs(xs - exact).max(axis=1)[1:], np.abs(xs[1:] - c).max(axis=1)
 
