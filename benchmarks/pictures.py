@@ -72,7 +72,7 @@ def plants() -> None:
             axis.set_title(title, fontsize=9)
             axis.axis("off")
         figure.tight_layout(pad=0.2)
-        figure.savefig(PICTURES / name)
+        figure.savefig(PICTURES / name, bbox_inches="tight")
         plt.close(figure)
 
 

@@ -127,6 +127,18 @@ def test_constants_can_be_mapped_over(swim):
     assert np.abs(np.diff(mapped, axis=0)).max(axis=1).min() > 1e-3
 
 
+def test_gradient_matches_finite_differences():
+    with jax.enable_x64(True):
+        plant = swimmer("knife_edge", 6)
+        state = plant.place(jnp.asarray(plant.start_mean + 0.1))
+        control = jnp.asarray(0.5 * plant.control_high)
+        final = jax.jit(lambda offset: plant.observe(plant.step(state, control.at[7].set(offset))))
+        gradient = jax.jit(jax.jacfwd(lambda offset: plant.observe(plant.step(state, control.at[7].set(offset)))))(0.2)
+        step = 1e-5
+        np.testing.assert_allclose(gradient, (final(0.2 + step) - final(0.2 - step)) / (2 * step), rtol=1e-5, atol=1e-7)
+        assert np.abs(gradient[:4]).min() > 1e-5
+
+
 # Mean |e|^2 over 20 s, from starts not used in the search; a random policy has more than .9 in all of them.
 BARS = {
     (2, "knife_edge"): 0.03,
