@@ -37,8 +37,8 @@ def limbs(parents: tuple[int, ...]) -> Limbs:
             chains[-1].append(parents.index(chains[-1][-1]))
     alike = len({len(chain) for chain in chains}) == 1
     if not alike or len(trunk) + sum(map(len, chains)) < len(parents):
-        return Limbs(np.arange(len(parents)), np.zeros((0, 0), int))
-    return Limbs(np.array(trunk, int), np.array(chains))
+        return Limbs(np.arange(len(parents), dtype=np.int32), np.zeros((0, 0), np.int32))
+    return Limbs(np.array(trunk, np.int32), np.array(chains, np.int32))
 
 
 def solve(inertia: Array, force: Array, parents: tuple[int, ...]) -> Array:
@@ -53,7 +53,7 @@ def solve(inertia: Array, force: Array, parents: tuple[int, ...]) -> Array:
     reduced = inertia[np.ix_(trunk, trunk)] - left[:, :-1]
     base = _solve(reduced, (force[trunk] - left[:, -1])[:, None])[:, 0]
     ends = solved[..., -1] - solved[..., :-1] @ base
-    order = np.argsort(np.concatenate([trunk, chains.ravel()]))
+    order = np.argsort(np.concatenate([trunk, chains.ravel()])).astype(np.int32)
     return jnp.concatenate([base, ends.ravel()])[order]
 
 
