@@ -28,6 +28,7 @@ with redirect_stdout(io.StringIO()):  # on import MJX prints that warp, which we
     from mujoco import mjx
 
 from pegasus_envs.fluid import passive_force
+from pegasus_envs.inertia import solve
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -138,7 +139,7 @@ def acceleration(physics: Physics, qpos: Array, qvel: Array, control: Array) -> 
     moment = data._impl.actuator_moment
     data = mjx.fwd_actuation(model, data.tree_replace({"_impl.actuator_velocity": moment @ qvel}))
     force = passive_force(physics, data) - data.qfrc_bias + data.qfrc_actuator
-    return jax.scipy.linalg.solve(mjx.full_m(model, data), force, assume_a="pos")
+    return solve(mjx.full_m(model, data), force, tuple(physics.host.dof_parentid.tolist()))
 
 
 def displace(physics: Physics, qpos: Array, velocity: Array, time: Array | float) -> Array:

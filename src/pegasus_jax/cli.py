@@ -35,6 +35,7 @@ examples
   pegasus-train task=cartpole algorithm=deep_pilco search.clip=1
   pegasus-train task=swimmer_corkscrew legs=6
   pegasus-train task=gym env=Pendulum-v1 cost=mymodule:cost horizon=40
+  pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
   pegasus-train resume=runs/demo trials=20
 
 Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, pegasus-play RUN, or
@@ -109,10 +110,10 @@ def _train(words: Sequence[str]) -> None:
         config = settings.override(settings.load(first / "config.yaml"), settings.values(rest))
         runs = runs or {config.seed: home}
     else:
-        config = settings.parse(rest, options=OPTIONS)
+        config = tasks.pinned(settings.parse(rest, options=OPTIONS))
         seeds = range(config.seed, config.seed + _whole("seeds", options.get("seeds", "1")))
-        label = f"seed{seeds[0]}" if len(seeds) == 1 else f"seeds{seeds[0]}-{seeds[-1]}"
-        home = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{config.task}-{label}"))
+        name = f"seed{seeds[0]}" if len(seeds) == 1 else f"seeds{seeds[0]}-{seeds[-1]}"
+        home = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{tasks.label(config)}-{name}"))
         runs = {config.seed: home} if len(seeds) == 1 else {seed: home / f"seed{seed}" for seed in seeds}
     if len(runs) > 1 and config.task == tasks.GYM:
         raise SettingError(f"seeds={len(runs)} is too many for task=gym, whose environment is one object; seeds=1")

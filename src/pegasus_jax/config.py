@@ -324,9 +324,17 @@ class Config:
     task: str = setting("cartpole", "what to learn")
     legs: int = setting(2, "that a swimmer drives: 2 or 6; the other tasks have none")
     env: str | None = setting(None, "of task=gym: the environment's Gymnasium id")
-    cost: str | None = setting(None, "of task=gym: module:function, observation [D] -> cost in [0, 1], in JAX")
-    angles: tuple[int, ...] = setting((), "of task=gym: the entries of the observation that are angles [rad]")
-    horizon: int | None = setting(None, "of task=gym: control periods an episode; null: the environment's own limit")
+    mjcf: str | None = setting(None, "of task=mjcf: the MuJoCo file, path/to/model.xml")
+    mjcf_digest: str | None = setting(None, "SHA-256 of the compiled mjcf= file; a run notes it, and refuses another")
+    cost: str | None = setting(None, "of task=gym|mjcf: module:function, observation [D] -> cost in [0, 1], in JAX")
+    angles: tuple[int, ...] = setting((), "of task=gym|mjcf: the entries of the observation that are angles [rad]")
+    horizon: int | None = setting(None, "of task=gym|mjcf: control periods an episode; null: a gym's own limit")
+    dt: float | None = setting(None, "of task=mjcf: control period [s], a whole number of the file's time steps")
+    observe: tuple[str, ...] = setting((), "of task=mjcf: as [qpos.0,qvel.1]; []: all positions, then all velocities")
+    control_low: tuple[float, ...] = setting((), "of task=mjcf: least controls; []: the file's ctrlrange")
+    control_high: tuple[float, ...] = setting((), "of task=mjcf: greatest controls; []: the file's ctrlrange")
+    start_mean: tuple[float, ...] = setting((), "of task=mjcf: of the observation; []: the file's pose, at rest")
+    start_std: tuple[float, ...] = setting((0.1,), "of task=mjcf: spread of the starts, one for all or one each")
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
     precision: str = setting("single", "of all numbers: single (32 bits) or double (64)")
@@ -339,7 +347,12 @@ class Config:
     def __post_init__(self) -> None:
         _choice("legs", self.legs, LEGS)
         _choice("precision", self.precision, PRECISIONS)
-        object.__setattr__(self, "angles", tuple(self.angles))
+        for name in ("angles", "observe", "control_low", "control_high", "start_mean", "start_std"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for deviation in self.start_std:
+            _within("start_std", deviation, 0)
+        if self.dt is not None:
+            _within("dt", self.dt, 0, open_low=True)
         if self.horizon is not None:
             _within("horizon", self.horizon, 1)
         _within("seed", self.seed, 0, 2**32 - 1)
