@@ -10,21 +10,14 @@ already is not run again; delete its JSON to repeat it. On two CPU cores a varia
 import json
 import shlex
 import sys
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import matplotlib
-
-matplotlib.use("Agg")
-
-import matplotlib.pyplot as plt
 import numpy as np
-from matplotlib.axes import Axes
-from scipy.stats import bootstrap, trim_mean
 
 from benchmarks.study import RESULTS, seed_list, study
 from pegasus_jax import settings
 from pegasus_jax.record import about
+from pegasus_jax.report.curves import picture
 
 
 class Figure(NamedTuple):
@@ -79,39 +72,9 @@ def main(words: list[str]) -> None:
             RESULTS.mkdir(exist_ok=True)
             path.write_text(json.dumps(result) + "\n")
         results[label] = json.loads(path.read_text())
-    draw(figure.title, results, RESULTS / f"{name}.png")
-
-
-def draw(title: str, results: dict[str, dict[str, Any]], path: Path) -> None:
-    """Cost and success of every seed of every variant against plant time."""
-    figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(7, 6))
-    for colour, (label, result) in enumerate(results.items()):
-        curves(top, result["plant_seconds"], np.asarray(result["mean_cost"]), f"C{colour}", label)
-        curves(bottom, result["plant_seconds"], np.asarray(result["success_rate"]), f"C{colour}", label)
-    top.set(title=title, ylabel="mean cost a step")
-    bottom.set(ylabel="success rate", xlabel="plant time [s]")
-    if len(results) > 1:
-        top.legend(frameon=False)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-
-
-def curves(axis: Axes, x: list[float], values: np.ndarray, colour: str, label: str) -> None:
-    """Raw curves [S, T] thin; interquartile mean over seeds thick, with its 95 % bootstrap interval."""
-    axis.plot(x, values.T, color=colour, lw=0.5, alpha=0.4)
-    axis.plot(x, trim_mean(values, 0.25, axis=0), color=colour, lw=2, label=label)
-    if values.shape[0] > 2:
-        interval = bootstrap(
-            (values,),
-            lambda v, axis: trim_mean(v, 0.25, axis=axis),
-            axis=0,
-            n_resamples=2000,
-            method="percentile",
-            rng=np.random.default_rng(0),
-        ).confidence_interval
-        axis.fill_between(x, interval.low, interval.high, color=colour, alpha=0.2, lw=0)
-    axis.grid(alpha=0.25)
+    curves = {label: (np.asarray(r["mean_cost"]), np.asarray(r["success_rate"])) for label, r in results.items()}
+    seconds = max((result["plant_seconds"] for result in results.values()), key=len)
+    picture(curves, seconds, RESULTS / f"{name}.png", figure.title)
 
 
 if __name__ == "__main__":

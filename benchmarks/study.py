@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import settings
-from pegasus_jax.build import build
+from pegasus_jax.build import build, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.record import about
 from pegasus_jax.trial import run
@@ -27,6 +27,7 @@ RESULTS = Path(__file__).parent / "results"
 
 def study(config: Config, seeds: list[int]) -> dict[str, Any]:
     """Curves [S, T] of a configuration over seeds."""
+    set_precision(config)
     experiment = build(config)
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
     began = time.monotonic()

@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from pegasus_jax.config import Config, SettingError
 
@@ -18,16 +19,23 @@ pegasus-train resume=RUN [trials=N]             go on with a run, also one that 
   policy=dropout_mlp    controller: {policies}
   algorithm=pegasus     how to search: {algorithms}
   out=runs/...          the run's folder (default: runs/TASK-seedN)
+  seeds=1               so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN
+
+  mesh=SEEDSxPARTICLES  the devices that share seeds and particles (default: as many as share the seeds evenly)
+  distributed=true      started on several hosts at once by SLURM or MPI: their devices act as one machine; without
+                        those, coordinator=HOST:PORT processes=N process=I on each. They share OUT on one file system
 
 A named variant brings its defaults; the settings below change them one by one.
 {settings}
-
+{others}
 examples
   pegasus-train task=cartpole
   pegasus-train task=cartpole policy.hidden=[50,50] seed=3 trials=10 out=runs/demo
+  pegasus-train task=cartpole seeds=10
   pegasus-train task=cartpole algorithm=deep_pilco search.clip=1
   pegasus-train task=swimmer_corkscrew legs=6
   pegasus-train task=gym env=Pendulum-v1 cost=mymodule:cost horizon=40
+  pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
   pegasus-train resume=runs/demo trials=20
 
 Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, pegasus-play RUN, or
@@ -43,10 +51,12 @@ SHA-256 over data, model and policy parameters. With json=true, one JSON object.
 """
 
 PLOT = """\
-pegasus-plot RUN     draw a run, finished or not
+pegasus-plot RUN     draw a run, or the runs of many seeds, finished or not
 
 Writes RUN/plots/learning.png (cost and success against plant time) and RUN/plots/trial_NNNN.png for every trial:
 states, force and cost of the imagined particles after that trial, and over them what the plant did next.
+For a folder of seeds, FOLDER/learning.png: every seed's raw curve thin, their interquartile mean thick with its 95 %
+bootstrap interval.
 """
 
 PLAY = """\
@@ -83,28 +93,91 @@ def play() -> None:
     _main(_play, PLAY)
 
 
-def _train(words: Sequence[str]) -> None:
-    from pegasus_jax import record, settings
+OPTIONS = ("out", "resume", "seeds", "mesh", "distributed", "coordinator", "processes", "process")  # of pegasus-train
 
-    options, rest = settings.split(words, ("out", "resume"))
+
+def _train(words: Sequence[str]) -> None:
+    from pegasus_jax import record, settings, tasks
+
+    options, rest = settings.split(words, OPTIONS)
     command = shlex.join(["pegasus-train", *words])
     if "resume" in options:
-        if wrong := sorted(({*rest} | {*options}) - {"resume", "trials"}):
+        if wrong := sorted({*rest, *options} - {"resume", "trials", *OPTIONS[3:]}):
             raise SettingError(f"{wrong[0]} cannot be changed by resume=; only trials= can")
-        run = record.existing(Path(options["resume"]))
-        config = settings.override(settings.load(run / "config.yaml"), settings.values(rest))
+        home = Path(options["resume"])
+        runs = record.seeds_of(home)
+        first = record.existing(next(iter(runs.values()), home))
+        config = settings.override(settings.load(first / "config.yaml"), settings.values(rest))
+        runs = runs or {config.seed: home}
     else:
-        config = settings.parse(rest, options=("out", "resume"))
-        run = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{config.task}-seed{config.seed}"))
-    from pegasus_jax.build import build
+        config = tasks.pinned(settings.parse(rest, options=OPTIONS))
+        seeds = range(config.seed, config.seed + _whole("seeds", options.get("seeds", "1")))
+        name = f"seed{seeds[0]}" if len(seeds) == 1 else f"seeds{seeds[0]}-{seeds[-1]}"
+        home = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{tasks.label(config)}-{name}"))
+        runs = {config.seed: home} if len(seeds) == 1 else {seed: home / f"seed{seed}" for seed in seeds}
+    if len(runs) > 1 and config.task == tasks.GYM:
+        raise SettingError(f"seeds={len(runs)} is too many for task=gym, whose environment is one object; seeds=1")
+    _join(options)
+    over = _mesh(options.get("mesh"), len(runs))
+    from pegasus_jax.build import build, set_precision
+    from pegasus_jax.program import leads
 
+    set_precision(config)
     build(config)  # so that impossible settings end here, before anything is written
-    if "resume" not in options:
-        record.create(run)
-    from pegasus_jax.train import train as run_trials
+    if "resume" not in options and leads():
+        if record.seeds_of(home):
+            raise SettingError(f"out={home} holds runs already; resume={home} goes on, out={record.free(home)} is free")
+        for run in runs.values():
+            record.create(run)
+    from pegasus_jax.train import train_seeds
 
-    run_trials(config, run, resume="resume" in options, command=command)
-    print(f"done: {run} (pegasus-plot {run}, pegasus-eval {run})")
+    train_seeds(config, runs, resume="resume" in options, command=command, mesh=over)
+    if leads():
+        print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
+
+
+def _join(options: dict[str, str]) -> None:
+    """Join the other processes of a study, if there are any, through jax.distributed."""
+    import jax
+
+    given = {name for name in ("coordinator", "processes", "process") if name in options}
+    if not given and options.get("distributed", "false") == "false":
+        return
+    if given and len(given) < 3:
+        raise SettingError("coordinator=HOST:PORT, processes=N and process=I (from 0) go together")
+    if options.get("distributed", "true") != "true":
+        raise SettingError(f"distributed={options['distributed']} is neither true nor false")
+    try:
+        if given:
+            count, index = (_whole(name, options[name]) for name in ("processes", "process"))
+            jax.distributed.initialize(options["coordinator"], count, index)
+        else:
+            jax.distributed.initialize()  # SLURM, Open MPI and others say where the coordinator is
+    except (RuntimeError, ValueError) as error:
+        raise SettingError(f"distributed=true: {str(error).splitlines()[0]}; or give coordinator=HOST:PORT") from error
+
+
+def _mesh(text: str | None, seeds: int) -> Any:
+    """The mesh that mesh=SEEDSxPARTICLES asks for; by default as many devices as share the seeds evenly."""
+    import math
+
+    import jax
+
+    from pegasus_jax.mesh import mesh
+
+    if text is None:
+        return mesh(math.gcd(seeds, jax.device_count()), 1)
+    first, cross, second = text.partition("x")
+    if not (cross and first.isdecimal() and second.isdecimal() and int(first) and int(second)):
+        raise SettingError(f"mesh={text} is not of the form SEEDSxPARTICLES; for example mesh=4x1")
+    if seeds % int(first):
+        raise SettingError(
+            f"mesh={text} cannot share {seeds} seeds evenly; mesh={math.gcd(seeds, int(first))}x{second}"
+        )
+    try:
+        return mesh(int(first), int(second))
+    except ValueError as error:
+        raise SettingError(f"mesh={text} {error}") from error
 
 
 def _evaluate(words: Sequence[str]) -> None:
@@ -122,10 +195,14 @@ def _evaluate(words: Sequence[str]) -> None:
 
 
 def _plot(words: Sequence[str]) -> None:
-    run, _ = _run_and(words, {})
-    from pegasus_jax import settings, tasks
+    run, _ = _run_and(words, {}, many=True)
+    from pegasus_jax import record, settings, tasks
+    from pegasus_jax.report.curves import seeds_picture
     from pegasus_jax.report.plot import run_pictures
 
+    if runs := record.seeds_of(run):
+        print(seeds_picture(list(runs.values()), run / "learning.png"))
+        return
     config = settings.load(run / "config.yaml")
     for path in run_pictures(run, tasks.of_config(config)):
         print(path)
@@ -139,8 +216,8 @@ def _play(words: Sequence[str]) -> None:
     print(film(run, episodes, seed))
 
 
-def _run_and(words: Sequence[str], defaults: dict[str, str]) -> tuple[Path, dict[str, str]]:
-    """The run's folder and the options of a command that reads a run."""
+def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False) -> tuple[Path, dict[str, str]]:
+    """The run's folder, or with `many` maybe that of several seeds, and the options of a command that reads it."""
     from pegasus_jax import record, settings
     from pegasus_jax.config import nearest
 
@@ -153,11 +230,16 @@ def _run_and(words: Sequence[str], defaults: dict[str, str]) -> tuple[Path, dict
             raise SettingError(
                 f"{key} is not an option here; {nearest(key, defaults) if defaults else 'there are none'}"
             )
-    return record.existing(Path(named[0])), defaults | rest
+    path = Path(named[0])
+    if runs := record.seeds_of(path):
+        if not many:
+            raise SettingError(f"{path} holds the runs of {len(runs)} seeds; name one, for example {runs[min(runs)]}")
+        return path, defaults | rest
+    return record.existing(path), defaults | rest
 
 
 def _whole(name: str, text: str) -> int:
-    if not text.isdecimal() or (name == "episodes" and int(text) < 1):
+    if not text.isdecimal() or (name in ("episodes", "seeds") and int(text) < 1):
         raise SettingError(f"{name}={text} is not a whole number; for example {name}=20")
     return int(text)
 
@@ -166,12 +248,19 @@ def _help(text: str) -> str:
     if "{settings}" not in text:
         return text
     from pegasus_jax import settings
-    from pegasus_jax.config import ALGORITHMS, MODELS, POLICIES
+    from pegasus_jax.config import ALGORITHMS, KINDS, MODELS, POLICIES
     from pegasus_jax.tasks import NAMES
 
     named = dict(tasks=NAMES, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
     lists = {name: ", ".join(values) for name, values in named.items()}
-    return text.format(settings="\n".join(settings.help_lines(Config())), **lists)
+    others = [
+        f"\nwith {section}.kind={kind}, chosen by model=, policy= or algorithm=\n"
+        + "\n".join(settings.help_lines(default, f"{section}."))
+        + "\n"
+        for section, kinds in KINDS.items()
+        for kind, default in list(kinds.items())[1:]
+    ]
+    return text.format(settings="\n".join(settings.help_lines(Config())), others="".join(others), **lists)
 
 
 def _main(command: Callable[[Sequence[str]], None], text: str) -> None:

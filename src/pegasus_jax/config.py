@@ -51,6 +51,14 @@ def _layers(name: str, value: Any) -> tuple[int, ...]:
     return layers
 
 
+def _kind(section: str, value: str, kind: str) -> None:
+    """A section's kind says which class it is; a variant changes it, never a single setting."""
+    if value != kind:
+        raise SettingError(
+            f"{section}.kind={value} cannot be set: model=, policy= and algorithm= choose what {section} is"
+        )
+
+
 def setting(default: Any, text: str) -> Any:
     """A field with its help text."""
     return field(default=default, metadata={"help": text})
@@ -63,14 +71,18 @@ INITIALISERS = ("glorot", "orthogonal")
 SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
 AGGREGATES = ("mean", "total")
+COSTS = ("particles", "matched")
 EXECUTIONS = ("sampled", "mean")
 LEGS = (2, 6)
+PRECISIONS = ("single", "double")
 
 
 @dataclass(frozen=True)
 class BNN:
-    """Bayesian neural network dynamics."""
+    """Bayesian neural network dynamics, or an ensemble of them."""
 
+    kind: str = setting("bnn", "")
+    members: int = setting(1, "networks fitted side by side; each particle follows one of them")
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
     rate: float = setting(0.1, "drop probability of binary dropout, initial one of concrete dropout")
@@ -86,6 +98,8 @@ class BNN:
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
+        _kind("model", self.kind, "bnn")
+        _within("model.members", self.members, 1)
         object.__setattr__(self, "hidden", _layers("model.hidden", self.hidden))
         _choice("model.activation", self.activation, ACTIVATIONS)
         _within("model.kl_weight", self.kl_weight, 0)
@@ -102,9 +116,36 @@ class BNN:
 
 
 @dataclass(frozen=True)
+class GP:
+    """Exact Gaussian-process dynamics."""
+
+    kind: str = setting("gp", "")
+    features: int = setting(200, "sines and cosines in a particle's function, before the data correct it")
+
+    def __post_init__(self) -> None:
+        _kind("model", self.kind, "gp")
+        _within("model.features", self.features, 2)
+        if self.features % 2:
+            raise SettingError(f"model.features={self.features} must be even; the nearest is {self.features + 1}")
+
+
+@dataclass(frozen=True)
+class SSGP:
+    """Sparse-spectrum Gaussian-process dynamics."""
+
+    kind: str = setting("ssgp", "")
+    points: int = setting(100, "frequencies of each dimension, a cosine and a sine each")
+
+    def __post_init__(self) -> None:
+        _kind("model", self.kind, "ssgp")
+        _within("model.points", self.points, 1)
+
+
+@dataclass(frozen=True)
 class MLP:
     """A ReLU network controller."""
 
+    kind: str = setting("mlp", "")
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: float = setting(0.1, "drop probability of the hidden units; 0 is a deterministic policy")
     squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
@@ -113,6 +154,7 @@ class MLP:
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
+        _kind("policy", self.kind, "mlp")
         object.__setattr__(self, "hidden", _layers("policy.hidden", self.hidden))
         _choice("policy.squash", self.squash, SQUASHES)
         _choice("policy.execution", self.execution, EXECUTIONS)
@@ -122,18 +164,62 @@ class MLP:
 
 
 @dataclass(frozen=True)
-class Fit:
-    """Model learning after each trial."""
+class RBF:
+    """A controller of radial basis functions: the mean of a Gaussian process, PILCO's."""
 
+    kind: str = setting("rbf", "")
+    units: int = setting(30, "radial basis functions")
+    squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
+    execution = "mean"  # no setting: there is nothing to sample
+
+    def __post_init__(self) -> None:
+        _kind("policy", self.kind, "rbf")
+        _within("policy.units", self.units, 1)
+        _choice("policy.squash", self.squash, SQUASHES)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A linear controller of the encoded state."""
+
+    kind: str = setting("linear", "")
+    squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
+    execution = "mean"  # no setting: there is nothing to sample
+
+    def __post_init__(self) -> None:
+        _kind("policy", self.kind, "linear")
+        _choice("policy.squash", self.squash, SQUASHES)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Model learning after each trial, by Adam on minibatches."""
+
+    kind: str = setting("adam", "")
     steps: int = setting(2000, "updates a trial")
     batch: int = setting(100, "rows an update")
     learning_rate: float = setting(3e-4, "Adam's step size")
     reset: bool = setting(False, "forget Adam's moments at each trial")
 
     def __post_init__(self) -> None:
+        _kind("fit", self.kind, "adam")
         _within("fit.steps", self.steps, 1)
         _within("fit.batch", self.batch, 1)
         _within("fit.learning_rate", self.learning_rate, 0, open_low=True)
+
+
+@dataclass(frozen=True)
+class LBFGS:
+    """Model learning after each trial, by L-BFGS on all data."""
+
+    kind: str = setting("lbfgs", "")
+    steps: int = setting(300, "iterations a trial, at most")
+    starts: int = setting(100, "fresh parameters, of which the best, or the current ones, begin")
+
+    def __post_init__(self) -> None:
+        _kind("fit", self.kind, "lbfgs")
+        _within("fit.steps", self.steps, 1)
+        _within("fit.starts", self.starts, 1)
 
 
 @dataclass(frozen=True)
@@ -153,8 +239,9 @@ class Period:
 
 @dataclass(frozen=True)
 class Search:
-    """Policy search after each fit."""
+    """Policy search after each fit, along the gradient of imagined rollouts of particles."""
 
+    kind: str = setting("particles", "")
     steps: int = setting(1000, "iterations a trial")
     particles: int = setting(100, "K, imagined rollouts an iteration")
     learning_rate: float = setting(1e-3, "Adam's step size")
@@ -163,6 +250,10 @@ class Search:
     balanced: bool = setting(False, "make the drawn noise exactly zero mean, unit covariance over the particles")
     aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
     discount: float = setting(1.0, "weight of a later step against the one before")
+    cost: str = setting("particles", "of each of the particles, or the expected one of the matched Gaussian: matched")
+    risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
+    truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
+    best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
     policy_noise: float = setting(1.0, "factor of the predicted noise on what the policy sees")
@@ -171,11 +262,43 @@ class Search:
     period: Period = Period()
 
     def __post_init__(self) -> None:
+        _kind("search", self.kind, "particles")
         _within("search.steps", self.steps, 1)
         _within("search.particles", self.particles, 2)
         _within("search.learning_rate", self.learning_rate, 0, open_low=True)
         if self.clip is not None:
             _within("search.clip", self.clip, 0, open_low=True)
+        _choice("search.aggregate", self.aggregate, AGGREGATES)
+        _within("search.discount", self.discount, 0, 1, open_low=True)
+        _choice("search.cost", self.cost, COSTS)
+        _within("search.risk", self.risk, 0, 1, open_low=True)
+        if self.risk < 1 and self.cost == "matched":
+            raise SettingError(f"search.risk={self.risk:g} needs the cost of each particle: search.cost=particles")
+        if self.truncate is not None:
+            _within("search.truncate", self.truncate, 1)
+        for name in ("policy_noise", "state_noise", "cost_noise"):
+            _within(f"search.{name}", getattr(self, name), 0)
+
+
+@dataclass(frozen=True)
+class Analytic:
+    """Policy search after each fit, PILCO's: L-BFGS on the expected cost of a Gaussian, propagated analytically."""
+
+    kind: str = setting("analytic", "")
+    steps: int = setting(100, "iterations of L-BFGS a trial")
+    particles: int = setting(100, "K, rollouts imagined afterwards for the record; the search has none")
+    aggregate: str = setting("mean", "over the horizon: mean, or total, PILCO's sum")
+    discount: float = setting(1.0, "weight of a later step against the one before")
+    restart: bool = setting(True, "start a search from a fresh policy when it expects a lower cost than the old one")
+    policy_noise: float = setting(0.0, "factor of the model's noise on what the policy sees")
+    state_noise: float = setting(0.0, "factor of the model's noise added to the state")
+    cost_noise: float = setting(0.0, "factor of the model's noise on what the cost sees")
+    reset = True  # no setting: curvature is that of one model
+
+    def __post_init__(self) -> None:
+        _kind("search", self.kind, "analytic")
+        _within("search.steps", self.steps, 1)
+        _within("search.particles", self.particles, 2)
         _choice("search.aggregate", self.aggregate, AGGREGATES)
         _within("search.discount", self.discount, 0, 1, open_low=True)
         for name in ("policy_noise", "state_noise", "cost_noise"):
@@ -201,38 +324,61 @@ class Config:
     task: str = setting("cartpole", "what to learn")
     legs: int = setting(2, "that a swimmer drives: 2 or 6; the other tasks have none")
     env: str | None = setting(None, "of task=gym: the environment's Gymnasium id")
-    cost: str | None = setting(None, "of task=gym: module:function, observation [D] -> cost in [0, 1], in JAX")
-    angles: tuple[int, ...] = setting((), "of task=gym: the entries of the observation that are angles [rad]")
-    horizon: int | None = setting(None, "of task=gym: control periods an episode; null: the environment's own limit")
+    mjcf: str | None = setting(None, "of task=mjcf: the MuJoCo file, path/to/model.xml")
+    mjcf_digest: str | None = setting(None, "SHA-256 of the compiled mjcf= file; a run notes it, and refuses another")
+    cost: str | None = setting(None, "of task=gym|mjcf: module:function, observation [D] -> cost in [0, 1], in JAX")
+    angles: tuple[int, ...] = setting((), "of task=gym|mjcf: the entries of the observation that are angles [rad]")
+    horizon: int | None = setting(None, "of task=gym|mjcf: control periods an episode; null: a gym's own limit")
+    dt: float | None = setting(None, "of task=mjcf: control period [s], a whole number of the file's time steps")
+    observe: tuple[str, ...] = setting((), "of task=mjcf: as [qpos.0,qvel.1]; []: all positions, then all velocities")
+    control_low: tuple[float, ...] = setting((), "of task=mjcf: least controls; []: the file's ctrlrange")
+    control_high: tuple[float, ...] = setting((), "of task=mjcf: greatest controls; []: the file's ctrlrange")
+    start_mean: tuple[float, ...] = setting((), "of task=mjcf: of the observation; []: the file's pose, at rest")
+    start_std: tuple[float, ...] = setting((0.1,), "of task=mjcf: spread of the starts, one for all or one each")
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
-    model: BNN = BNN()
-    policy: MLP = MLP()
-    fit: Fit = Fit()
-    search: Search = Search()
+    precision: str = setting("single", "of all numbers: single (32 bits) or double (64)")
+    model: BNN | GP | SSGP = BNN()
+    policy: MLP | RBF | Linear = MLP()
+    fit: Fit | LBFGS = Fit()
+    search: Search | Analytic = Search()
     explore: Explore = Explore()
 
     def __post_init__(self) -> None:
         _choice("legs", self.legs, LEGS)
-        object.__setattr__(self, "angles", tuple(self.angles))
+        _choice("precision", self.precision, PRECISIONS)
+        for name in ("angles", "observe", "control_low", "control_high", "start_mean", "start_std"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for deviation in self.start_std:
+            _within("start_std", deviation, 0)
+        if self.dt is not None:
+            _within("dt", self.dt, 0, open_low=True)
         if self.horizon is not None:
             _within("horizon", self.horizon, 1)
         _within("seed", self.seed, 0, 2**32 - 1)
         _within("trials", self.trials, 1, 10_000)
 
 
-# The named variants that `model=`, `policy=` and `algorithm=` select.
-MODELS: dict[str, BNN] = {
-    "log_normal": BNN(),
-    "binary": BNN(dropout="binary"),
-    "concrete": BNN(dropout="concrete"),
-    "gaussian": BNN(dropout="gaussian"),
-    "sparse": BNN(dropout="sparse"),
-    "deterministic": BNN(dropout="none"),
+# The named variants that `model=`, `policy=` and `algorithm=` select: what each changes in the defaults, whole sections
+# first. A dotted change counts only where the chosen sections have such a setting.
+MODELS: dict[str, dict[str, Any]] = {
+    "log_normal": {},
+    "binary": {"model": BNN(dropout="binary")},
+    "concrete": {"model": BNN(dropout="concrete")},
+    "gaussian": {"model": BNN(dropout="gaussian")},
+    "sparse": {"model": BNN(dropout="sparse")},
+    "deterministic": {"model": BNN(dropout="none")},
+    "ensemble": {"model": BNN(dropout="none", members=5)},
+    # The number of steps once more, because a task's own is meant for minibatches.
+    "gp": {"model": GP(), "fit": LBFGS(starts=10), "fit.steps": 300},
+    "ssgp": {"model": SSGP(), "fit": LBFGS(), "fit.steps": 300},
 }
-POLICIES: dict[str, MLP] = {
-    "dropout_mlp": MLP(),
-    "mlp": MLP(dropout=0.0),
+POLICIES: dict[str, dict[str, Any]] = {
+    "dropout_mlp": {},
+    "mlp": {"policy": MLP(dropout=0.0)},
+    "rbf": {"policy": RBF()},
+    "rbf100": {"policy": RBF(units=100)},
+    "linear": {"policy": Linear()},
 }
 ALGORITHMS: dict[str, dict[str, Any]] = {
     "pegasus": {},  # the defaults: what learned best (docs/decisions/0001)
@@ -240,7 +386,11 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
         "model.activation": "relu",
         "model.kl_weight": 1.0,
         "fit.learning_rate": 1e-4,
-        "search.period": {"start": 1, "dynamics": 0, "policy": 0, "sensor": 0, "match": 0},
+        "search.period.start": 1,
+        "search.period.dynamics": 0,
+        "search.period.policy": 0,
+        "search.period.sensor": 0,
+        "search.period.match": 0,
         "search.reset": False,
         "search.restart": False,
     },
@@ -251,6 +401,19 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
         "search.restart": False,
         "search.particles": 10,
         "search.clip": None,
-        "search.period": {"start": 1, "dynamics": 1, "policy": 1, "sensor": 1, "match": 1},
+        "search.period.start": 1,
+        "search.period.dynamics": 1,
+        "search.period.policy": 1,
+        "search.period.sensor": 1,
+        "search.period.match": 1,
     },
+    "pilco": {"search": Analytic(), "search.steps": Analytic.steps, "precision": "double"},
+}
+
+# What each section can be, by the kind that a stored config names.
+KINDS: dict[str, dict[str, Any]] = {
+    "model": {"bnn": BNN(), "gp": GP(), "ssgp": SSGP()},
+    "policy": {"mlp": MLP(), "rbf": RBF(), "linear": Linear()},
+    "fit": {"adam": Fit(), "lbfgs": LBFGS()},
+    "search": {"particles": Search(), "analytic": Analytic()},
 }

@@ -24,7 +24,7 @@ def watch(
     assert task.plant is not None, f"task {task.name} has no simulated plant"
     plant = task.plant
     begin, first, steps = jax.random.split(key, 3)
-    sensor_std = jnp.asarray(task.sensor_std, jnp.float32)
+    sensor_std = jnp.asarray(task.sensor_std, float)
 
     def measure(key: Key, state: object) -> Array:
         x = plant.observe(state)
@@ -55,7 +55,7 @@ def uniform(key: Key, low: Array, high: Array, horizon: int) -> Array:
 def random_walk(key: Key, low: Array, high: Array, horizon: int, move: float = 0.3, pull: float = 0.75) -> Array:
     """Random controls [H, U]: with probability `move` a step goes `pull` of the way to a fresh uniform draw.
 
-    The exploration of the authors' swimmer scripts (reference settings 3.4).
+    The exploration of the authors' swimmer scripts (docs/reference.md 3.4).
     """
     fresh_key, move_key = jax.random.split(key)
     fresh = uniform(fresh_key, low, high, horizon)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 
 from pegasus_jax.dataset import minibatch
-from pegasus_jax.types import Array, Batch, Dataset, Key, Learner, Params
+from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Fitter, Key, Learner, Params
 
 
 class FitInfo(NamedTuple):
@@ -54,3 +54,26 @@ def fit(
     learner, losses = jax.lax.scan(step, learner, jax.random.split(key, steps))
     tenth = max(steps // 10, 1)
     return learner, FitInfo(jnp.mean(losses[-tenth:]), jnp.mean(losses[:tenth]), skipped(learner.optimizer) - before)
+
+
+def minibatches(
+    dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch: int, reset: bool = False
+) -> Fitter:
+    """The fitter that takes `optimizer`'s steps on minibatches; with `reset` each fit starts with fresh moments."""
+    guarded_optimizer = guarded(optimizer)
+
+    def run(key: Key, learner: Learner, data: Dataset, steps: int) -> tuple[Learner, FitInfo]:
+        if reset:
+            learner = Learner(learner.params, guarded_optimizer.init(learner.params))
+        return fit(
+            key,
+            learner,
+            data,
+            prepare=dynamics.prepare,
+            loss=dynamics.loss,
+            optimizer=guarded_optimizer,
+            steps=steps,
+            batch=batch,
+        )
+
+    return Fitter(guarded_optimizer.init, run)

@@ -81,10 +81,16 @@ def existing(path: Path) -> Path:
     return path
 
 
+def seeds_of(path: Path) -> dict[int, Path]:
+    """Seed -> folder of the runs that one study left in `path`; none where it is a run itself, or nothing."""
+    found = sorted(path.glob("seed*/config.yaml"), key=lambda p: (len(p.parent.name), p.parent.name))
+    return {int(p.parent.name.removeprefix("seed")): p.parent for p in found if p.parent.name[4:].isdecimal()}
+
+
 def free(path: Path) -> Path:
     """The first of path, path-2, path-3, ... that holds no run."""
     candidates = [path, *(path.with_name(f"{path.name}-{i}") for i in range(2, 10_000))]
-    return next(p for p in candidates if not (p / "config.yaml").exists())
+    return next(p for p in candidates if not ((p / "config.yaml").exists() or seeds_of(p)))
 
 
 def lock(path: Path) -> FileLock:

@@ -1,16 +1,42 @@
 """Policy search: follow the gradient of the imagined cost under held scenarios (Alg. 3)."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
 from pegasus_jax import cost as costs
-from pegasus_jax.fit import skipped
+from pegasus_jax.fit import guarded, skipped
 from pegasus_jax.rollout import NoiseUse, rollout
-from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Policy, Scenarios
+from pegasus_jax.scenarios import Blocks, draw, redraw
+from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Period, Policy, Scenarios, Searcher
+
+
+class Remembering(NamedTuple):
+    """State of an optimiser that remembers the best parameters it has seen."""
+
+    inner_state: optax.OptState
+    best_value: Array  # [] the lowest objective so far
+    best_params: Params  # that had it
+
+
+def remembering(optimizer: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
+    """The optimiser, which also remembers the parameters with the lowest `value`; see `keeping_best`."""
+    optimizer = optax.with_extra_args_support(optimizer)
+
+    def init(params: Params) -> Remembering:
+        return Remembering(optimizer.init(params), jnp.full((), jnp.inf), params)
+
+    def update(updates: Params, state: Any, params: Params = None, *, value: Array, **extra: Any) -> tuple[Params, Any]:
+        updates, inner = optimizer.update(updates, state.inner_state, params, value=value, **extra)
+        better = value < state.best_value
+        kept = jax.tree.map(partial(jnp.where, better), params, state.best_params)
+        return updates, Remembering(inner, jnp.where(better, value, state.best_value), kept)
+
+    return optax.GradientTransformationExtraArgs(init, update)  # type: ignore[arg-type]
 
 
 class SearchInfo(NamedTuple):
@@ -32,9 +58,19 @@ def objective(
     cost: Callable[[Array], Array],
     aggregate: Callable[[Array], Array] = costs.mean,
     noise: NoiseUse = NoiseUse(),
+    truncate: int | None = None,
 ) -> Array:
-    """J(theta) (Alg. 3 line 16): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
-    imagined = rollout(policy_params, belief, scenarios, dynamics=dynamics, policy=policy, match=match, noise=noise)
+    """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
+    imagined = rollout(
+        policy_params,
+        belief,
+        scenarios,
+        dynamics=dynamics,
+        policy=policy,
+        match=match,
+        noise=noise,
+        truncate=truncate,
+    )
     return aggregate(cost(imagined.seen))
 
 
@@ -50,17 +86,18 @@ def optimise(
     steps: int,
     first: Array | int = 0,
 ) -> tuple[Learner, SearchInfo]:
-    """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 20).
+    """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 19).
 
     One call of n steps and two calls of n/2, the second with first=n/2, do the same.
     """
     first = jnp.asarray(first, jnp.int32)
+    optimizer = optax.with_extra_args_support(optimizer)
     before = skipped(learner.optimizer)
 
     def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], tuple[Array, Array]]:
         learner, scenarios = carry
         value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios)
-        updates, state = optimizer.update(gradient, learner.optimizer, learner.params)
+        updates, state = optimizer.update(gradient, learner.optimizer, learner.params, value=value)
         learner = Learner(optax.apply_updates(learner.params, updates), state)
         scenarios = redraw(key, i + 1, scenarios, belief)
         return (learner, scenarios), (value, optax.tree.norm(gradient))
@@ -68,3 +105,44 @@ def optimise(
     scenarios = draw(key, first, belief)
     (learner, _), (values, norms) = jax.lax.scan(step, (learner, scenarios), first + jnp.arange(steps))
     return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
+
+
+def particles(
+    objective: Callable[[Params, Params, Scenarios], Array],
+    optimizer: optax.GradientTransformation,
+    *,
+    blocks: Blocks,
+    period: Period,
+) -> Searcher:
+    """The searcher that follows the gradient of `objective` under scenarios drawn from `blocks`, held for `period`."""
+    optimizer = guarded(optimizer)
+    pieces: dict[str, Any] = dict(
+        draw=partial(draw, blocks=blocks, period=period),
+        redraw=partial(redraw, blocks=blocks, period=period),
+        objective=objective,
+        optimizer=optimizer,
+    )
+    return Searcher(
+        init=optimizer.init,
+        run=partial(optimise, **pieces),
+        value=lambda key, params, belief: objective(params, belief, pieces["draw"](key, 0, belief)),
+    )
+
+
+def keeping_best(searcher: Searcher, last: int) -> Searcher:
+    """The searcher that ends a trial's search of `last` iterations with the best parameters it met, not the last.
+
+    Its optimiser must be `remembering`. Values are compared as they are, like the authors' option to return the best:
+    with redrawn scenarios each is noisy, so the lowest is partly luck, and not as good as it looks.
+    """
+
+    def run(key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int) -> tuple[Learner, Any]:
+        known = optax.tree.get(learner.optimizer, "best_value")
+        known = jnp.where(jnp.asarray(first) == 0, jnp.inf, known)  # what an older model thought does not count
+        learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, best_value=known))
+        learner, info = searcher.run(key, learner, belief, first=first, steps=steps)
+        best = optax.tree.get(learner.optimizer, "best_params")
+        kept = jax.tree.map(partial(jnp.where, first + steps >= last), best, learner.params)
+        return learner._replace(params=kept), info
+
+    return searcher._replace(run=run)

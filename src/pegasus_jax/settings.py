@@ -10,7 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from pegasus_jax import tasks
-from pegasus_jax.config import ALGORITHMS, MODELS, POLICIES, Config, SettingError, nearest
+from pegasus_jax.config import ALGORITHMS, KINDS, MODELS, POLICIES, Config, SettingError, nearest
 from pegasus_jax.record import write_whole
 
 # Keys that select a named variant, and what they select from.
@@ -36,14 +36,17 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     for name, value in chosen.items():
         if value not in VARIANTS[name]:
             raise SettingError(f"{name}={value} is unknown; {nearest(value, VARIANTS[name])}")
-    config = Config(
-        task=chosen.get("task", Config.task),
-        model=MODELS.get(chosen.get("model", ""), Config.model),
-        policy=POLICIES.get(chosen.get("policy", ""), Config.policy),
-    )
+    variants: dict[str, Any] = {
+        **MODELS[chosen.get("model", "log_normal")],
+        **POLICIES[chosen.get("policy", "dropout_mlp")],
+        **ALGORITHMS[chosen.get("algorithm", "pegasus")],
+    }
+    sections = {name: value for name, value in variants.items() if dataclasses.is_dataclass(value)}
+    config = dataclasses.replace(Config(task=chosen.get("task", Config.task)), **sections)
     config = override(config, values({key: words[key] for key in ("legs",) if key in words}))
-    config = override(config, tasks.defaults(config.task, config.legs))
-    config = override(config, ALGORITHMS[chosen.get("algorithm", "pegasus")])
+    for changes in (tasks.defaults(config.task, config.legs), {k: v for k, v in variants.items() if k not in sections}):
+        there = leaves(config)
+        config = override(config, {key: value for key, value in changes.items() if key in there})
     known = leaves(config)
     for key in words:
         if key not in known:
@@ -80,7 +83,7 @@ def help_lines(node: Any, prefix: str = "") -> list[str]:
         value = getattr(node, f.name)
         if dataclasses.is_dataclass(value):
             lines += help_lines(value, f"{prefix}{f.name}.")
-        elif f"{prefix}{f.name}" not in VARIANTS:
+        elif f"{prefix}{f.name}" not in VARIANTS and f.metadata["help"]:
             lines.append(f"  {prefix + f.name + '=' + _text(value):34s} {f.metadata.get('help', '')}")
     return lines
 
@@ -98,7 +101,13 @@ def load(path: Path) -> Config:
         stored: Any = OmegaConf.to_container(OmegaConf.load(path))
     except (OSError, ValueError, OmegaConfBaseException, YAMLError) as error:
         raise SettingError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-    config = Config()
+    if not isinstance(stored, dict):
+        raise SettingError(f"{path} is not the config of a run")
+    chosen = {section: stored.get(f"{section}.kind") for section in KINDS}
+    for section, kind in chosen.items():
+        if kind not in (None, *KINDS[section]):
+            raise SettingError(f"{path}: {section}.kind={kind} is unknown; {nearest(kind, KINDS[section])}")
+    config = Config(**{section: KINDS[section][kind] for section, kind in chosen.items() if kind is not None})
     wrong = sorted(set(map(str, stored)) ^ set(leaves(config)))
     if wrong:
         raise SettingError(f"{path} is not the config of a run of this version: see {', '.join(wrong[:5])}")
@@ -129,8 +138,6 @@ def _changed(node: Any, changes: dict[str, Any], prefix: str) -> Any:
         head, _, rest = key.partition(".")
         if rest:
             below.setdefault(head, {})[rest] = value
-        elif dataclasses.is_dataclass(getattr(node, head)) and isinstance(value, dict):
-            below.setdefault(head, {}).update(value)
         else:
             here[head] = _converted(node, head, value, prefix + head)
     here |= {head: _changed(getattr(node, head), inner, f"{prefix}{head}.") for head, inner in below.items()}
@@ -159,6 +166,8 @@ def _kind(annotation: Any) -> str:
         bool: "true or false",
         str: "a word",
         tuple[int, ...]: "a list of whole numbers",
+        tuple[float, ...]: "a list of numbers",
+        tuple[str, ...]: "a list of words",
         str | None: "a word or null",
         int | None: "a whole number or null",
     }.get(annotation, "a number or null")

@@ -1,7 +1,8 @@
-"""The main job: run an experiment trial by trial on this machine, leaving a run's folder that survives anything."""
+"""The main job: an experiment trial by trial, for one seed or many at once, leaving folders that survive anything."""
 
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,71 +10,21 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh
 from tensorboardX import SummaryWriter
 
 from pegasus_jax import checkpoint, record, settings
-from pegasus_jax.build import build
+from pegasus_jax.build import build, set_precision
 from pegasus_jax.config import Config, SettingError
 from pegasus_jax.dataset import grow
+from pegasus_jax.program import Program, fetched, leads
 from pegasus_jax.progress import Display
 from pegasus_jax.record import RunError
 from pegasus_jax.trial import COLLECT, EVALUATE, trial_key
-from pegasus_jax.types import Experiment, Key, RunState, Task, Trajectory
+from pegasus_jax.types import Experiment, Key, Params, RunState, Task, Trajectory
 
 EPISODES = 20  # evaluation episodes a trial; never data
-
-
-class Jitted:
-    """A jitted function that says how long compiling took; compiles once, or it is a defect."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function, self.compiled, self.seconds = jax.jit(function), None, 0.0
-
-    def __call__(self, *arguments: Any) -> Any:
-        if self.compiled is None:
-            began = time.monotonic()
-            self.compiled = self.function.lower(*arguments).compile()
-            self.seconds = time.monotonic() - began
-        return jax.block_until_ready(self.compiled(*arguments))
-
-
-class Program:
-    """The compiled functions of an experiment, and the clock on them."""
-
-    def __init__(self, experiment: Experiment, search_steps: int) -> None:
-        self.chunk = chunk(search_steps)
-        self.chunks = search_steps // self.chunk
-        self.parts = {
-            "init": Jitted(experiment.init),
-            "episode": Jitted(experiment.episode),
-            "absorb": Jitted(experiment.absorb),
-            "fit": Jitted(experiment.fit),
-            "search": Jitted(partial(experiment.search, steps=self.chunk)),
-            "imagine": Jitted(experiment.imagine),
-        }
-        self.spent: dict[str, float] = {}
-
-    def __call__(self, part: str, *arguments: Any, purpose: str | None = None) -> Any:
-        """Run a part; its time is counted as that of `purpose`."""
-        jitted, name = self.parts[part], purpose or part
-        began, compiled = time.monotonic(), jitted.seconds
-        result = jitted(*arguments)
-        compiling = jitted.seconds - compiled
-        self.spent[name] = self.spent.get(name, 0.0) + time.monotonic() - began - compiling
-        self.spent["compile"] = self.spent.get("compile", 0.0) + compiling
-        return result
-
-    def seconds(self) -> dict[str, float]:
-        """Seconds spent in each part since the last call."""
-        spent, self.spent = self.spent, {}
-        names = ("collect", "fit", "search", "imagine", "evaluate", "compile")
-        return {name: round(spent.get(name, 0.0), 3) for name in names}
-
-
-def chunk(steps: int) -> int:
-    """Search iterations between two looks at the clock: a divisor of `steps` near a tenth of it."""
-    divisors = [d for d in range(1, steps + 1) if steps % d == 0]
-    return next(d for d in divisors if d * 20 >= steps)
 
 
 def train(config: Config, run: Path, *, resume: bool = False, command: str = "") -> RunState:
@@ -82,95 +33,137 @@ def train(config: Config, run: Path, *, resume: bool = False, command: str = "")
     Killed at any moment and resumed, it ends bit-equal to an uninterrupted run: every trial's randomness is a function
     of seed and trial, finished episodes are read back, and a trial cut short is done again from the state before it.
     """
-    with record.lock(run):
-        before = settings.load(run / "config.yaml") if resume else config
+    return part(train_seeds(config, {config.seed: run}, resume=resume, command=command), 0)
+
+
+def train_seeds(
+    config: Config, runs: dict[int, Path], *, resume: bool = False, command: str = "", mesh: Mesh | None = None
+) -> RunState:
+    """`train` for the seeds and folders of `runs`, all as one program; returns their states [S, ...].
+
+    Each folder is what a run of that seed alone would leave, and can be resumed alone. The seeds share nothing but the
+    clock: one that diverges leaves the others as they are. All go on from the newest trial that all have finished.
+    With a `mesh` (mesh.py) of several devices the seeds are shared out among them; where several processes hold the
+    devices, all call this together, see the same files, and the first one writes.
+    """
+    folders, seeds = list(runs.values()), list(runs)
+    with ExitStack() as held:
+        for run in folders if leads() else ():
+            held.enter_context(record.lock(run))
+        before = settings.load(folders[0] / "config.yaml") if resume else config
         if config.trials < before.trials:
             raise SettingError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
-        record.write_json(run / "run.json", record.about(command))
-        experiment = build(config)
-        program = Program(experiment, config.search.steps)
-        state = program("init", jax.random.key(config.seed))
-        display = Display(config.trials, 0)
-        if resume:
-            state = latest(run, before, display) or state
-            state = state._replace(data=grow(state.data, config.trials * experiment.task.horizon))
-        settings.save(config, run / "config.yaml")
-        done = int(state.trial)
-        display.done = done
-        record.write_trials(run, record.trials(run)[:done])
-        with display.running(), SummaryWriter(str(run / "tensorboard"), purge_step=done + 1) as board:
+        set_precision(config)
+        experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
+        program = Program(experiment, config.search.steps, len(seeds), mesh)
+        display = Display(config.trials, 0, quiet=not leads())
+        states = together(folders, replace(before, seed=0), display) if resume else None
+        if states is None:
+            states = program("init", jnp.stack([jax.random.key(seed) for seed in seeds]))
+        room = config.trials * experiment.task.horizon
+        if room > states.data.x.shape[1]:
+            states = states._replace(data=jax.vmap(partial(grow, capacity=room))(states.data))
+        done = display.done = int(fetched(states.trial)[0])
+        multihost_utils.sync_global_devices("every process has read what there is")
+        boards = []
+        for seed, run in runs.items() if leads() else ():
+            settings.save(replace(config, seed=seed), run / "config.yaml")
+            record.write_json(run / "run.json", record.about(command))
+            record.write_trials(run, record.trials(run)[:done])
+            boards.append(held.enter_context(SummaryWriter(str(run / "tensorboard"), purge_step=done + 1)))
+        with display.running():
             for trial in range(done + 1, config.trials + 1):
-                state, row = one_trial(state, trial, config, run, experiment, program, display)
-                record.write_trials(run, [*record.trials(run), row])
-                scalars(board, row)
-                checkpoint.save(run, trial, state)
-                display.line(summary(row, config.trials))
-    return state
+                states, rows = one_trial(states, trial, config, folders, experiment, program, display)
+                whole = fetched(states)
+                for index, board in enumerate(boards):
+                    record.write_trials(folders[index], [*record.trials(folders[index]), rows[index]])
+                    scalars(board, rows[index])
+                    checkpoint.save(folders[index], trial, part(whole, index))
+                display.line(summary(rows, config.trials))
+    return states
 
 
 def one_trial(
-    state: RunState,
+    states: RunState,
     trial: int,
     config: Config,
-    run: Path,
+    runs: Sequence[Path],
     experiment: Experiment,
     program: Program,
     display: Display,
-) -> tuple[RunState, dict[str, Any]]:
-    """Collect (or read back) an episode, absorb it, improve, evaluate; the row for trials.jsonl says how it went."""
+) -> tuple[RunState, list[dict[str, Any]]]:
+    """Collect (or read back) episodes, absorb, improve, evaluate; a row a run for its trials.jsonl says how it went."""
     task = experiment.task
     display.phase(trial, "collect")
-    episode = record.load_episode(run, trial)
-    if episode is None:
-        key = trial_key(state.key, trial, COLLECT)
-        exploring = jnp.asarray(trial <= config.explore.trials)
-        episode = program("episode", key, state.policy.params, exploring, purpose="collect")
-        record.save_episode(run, trial, episode, task)
-    state = program("absorb", state, jax.tree.map(jnp.asarray, episode))
+    episodes = collected(states, trial, config, runs, task, program)
+    states = program("absorb", states, jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes))
     display.phase(trial, "fit", 0.02)
-    state, fitted = program("fit", state)
-    objectives, norms, skipped = [], [], 0
+    states, fitted = fetched_info(program("fit", states))
+    found = []
     for i in range(program.chunks):
-        cost = objectives[-1][-1] if objectives else None
+        cost = np.mean(found[-1].objective[:, -1]) if found else None
         display.phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)
-        state, searched = program("search", state, jnp.int32(i * program.chunk))
-        objectives.append(np.asarray(searched.objective))
-        norms.append(np.asarray(searched.gradient_norm))
-        skipped += int(searched.skipped)
-    objective, norm = np.concatenate(objectives), np.concatenate(norms)
+        states, searched = fetched_info(program("search", states, jnp.int32(i * program.chunk)))
+        found.append(jax.tree.map(np.asarray, searched))
+    objective, norm = (np.concatenate([getattr(f, name) for f in found], 1) for name in ("objective", "gradient_norm"))
+    skipped = fitted.skipped + sum(f.skipped for f in found)
     display.phase(trial, "evaluate", 0.9)
-    imagined, imagined_cost = program("imagine", state)
-    record.save_imagined(run, trial, imagined, imagined_cost)
-    evaluation_key = trial_key(state.key, state.trial, EVALUATE)
-    evaluation = evaluate(evaluation_key, state, task, partial(program, "episode", purpose="evaluate"), EPISODES)
-    row = {
-        "trial": trial,
-        "plant_seconds": round(trial * task.horizon * task.dt, 6),
-        "random": trial <= config.explore.trials,
-        "episode_cost": float(np.mean(episode.cost)),
-        **evaluation,
-        "fit_loss": float(fitted.loss),
-        "objective_first": float(objective[0]),
-        "objective_last": float(objective[-1]),
-        "objective_fresh": float(jnp.mean(imagined_cost)),
-        "gradient_norm": float(np.median(norm)),
-        "skipped_updates": skipped + int(fitted.skipped),
-        "saturated": saturated(episode, task),
-        "seconds": program.seconds(),
-    }
-    return state, row
+    imagined, imagined_cost = fetched(program("imagine", states))
+    for index, run in enumerate(runs if leads() else ()):
+        record.save_imagined(run, trial, part(imagined, index), imagined_cost[index])
+    keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(fetched(states.key))
+    evaluation = evaluate(keys, states.policy.params, task, partial(program, "episode", purpose="evaluate"), EPISODES)
+    seconds = program.seconds()
+    rows = [
+        {
+            "trial": trial,
+            "plant_seconds": round(trial * task.horizon * task.dt, 6),
+            "random": trial <= config.explore.trials,
+            "episode_cost": float(np.mean(episode.cost)),
+            **evaluation[index],
+            "fit_loss": float(fitted.loss[index]),
+            "objective_first": float(objective[index, 0]),
+            "objective_last": float(objective[index, -1]),
+            "objective_fresh": float(jnp.mean(imagined_cost[index])),
+            "gradient_norm": float(np.median(norm[index])),
+            "skipped_updates": int(skipped[index]),
+            "saturated": saturated(episode, task),
+            "seconds": seconds,
+        }
+        for index, episode in enumerate(episodes)
+    ]
+    return states, rows
+
+
+def collected(
+    states: RunState, trial: int, config: Config, runs: Sequence[Path], task: Task, program: Program
+) -> list[Trajectory]:
+    """The episodes of a trial: those on disk as they are, the others run on the plant and made durable."""
+    episodes = [record.load_episode(run, trial) for run in runs]
+    if any(episode is None for episode in episodes):
+        keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(fetched(states.key))
+        exploring = jnp.asarray(trial <= config.explore.trials)
+        fresh = fetched(program("episode", keys, states.policy.params, exploring, purpose="collect"))
+        for index, run in enumerate(runs):
+            if episodes[index] is None:
+                episodes[index] = part(fresh, index)
+                if leads():
+                    record.save_episode(run, trial, part(fresh, index), task)
+    return [episode for episode in episodes if episode is not None]
 
 
 def evaluate(
-    key: Key, state: RunState, task: Task, episode: Callable[..., Trajectory], episodes: int
-) -> dict[str, float]:
-    """Mean cost a step and success rate over fresh episodes that are not data (reference settings 10)."""
+    keys: Key, params: Params, task: Task, episode: Callable[..., Trajectory], episodes: int
+) -> list[dict[str, float]]:
+    """Mean cost a step and success rate of each seed [S], over fresh episodes, not data (docs/reference.md 10)."""
     follow = jnp.asarray(False)  # the policy, not random controls
-    costs = np.stack(
-        [np.asarray(episode(k, state.policy.params, follow).cost) for k in jax.random.split(key, episodes)]
-    )
-    success = np.mean(costs[:, -5:], axis=1) < task.success
-    return {"mean_cost": float(np.mean(costs)), "success_rate": float(np.mean(success))}
+    each = jax.vmap(lambda key: jax.random.split(key, episodes), out_axes=1)(keys)
+    costs = np.stack([np.asarray(fetched(episode(some, params, follow).cost)) for some in each], axis=1)  # [S, E, H]
+    success = np.mean(costs[..., -5:], axis=-1) < task.success
+    return [
+        {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(succeeded))}
+        for cost, succeeded in zip(costs, success, strict=True)
+    ]
 
 
 def saturated(episode: Trajectory, task: Task) -> float:
@@ -181,29 +174,48 @@ def saturated(episode: Trajectory, task: Task) -> float:
     return float(np.mean((u < low + margin) | (u > high - margin)))
 
 
-def latest(run: Path, config: Config, display: Display) -> RunState | None:
-    """The state of the newest whole checkpoint, or None; every damaged one is named."""
-    for trial in checkpoint.available(run):
-        problem = checkpoint.damage(run, trial)
-        if problem is None:
-            return checkpoint.restore(run, trial, jax.eval_shape(build(config).init, jax.random.key(0)))
-        display.line(f"checkpoint {trial} is not usable: {problem}; going on from the one before it")
+def fetched_info(result: tuple[RunState, Any]) -> tuple[RunState, Any]:
+    """The states where they lie, and the info on this process."""
+    states, info = result
+    return states, fetched(info)
+
+
+def part(tree: Any, index: int) -> Any:
+    """One seed's part of a tree of arrays [S, ...]."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def together(runs: Sequence[Path], config: Config, display: Display) -> RunState | None:
+    """The states [S, ...] of the newest trial of which every run has a whole checkpoint, or None."""
+    shared = set.intersection(*(set(checkpoint.available(run)) for run in runs))
+    for trial in sorted(shared, reverse=True):
+        problems = [problem for run in runs if (problem := checkpoint.damage(run, trial)) is not None]
+        if not problems:
+            like = jax.eval_shape(build(config).init, jax.random.key(0))
+            states = [checkpoint.restore(run, trial, like) for run in runs]
+            return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+        for problem in problems:
+            display.line(f"checkpoint {trial} is not usable: {problem}; going on from the one before it")
     return None
 
 
 def newest(run: Path) -> tuple[Config, Experiment, RunState]:
     """A run's config, its experiment and its newest whole state. Raises RunError when there is none yet."""
     config = settings.load(run / "config.yaml")
-    state = latest(run, config, Display(config.trials, 0))
-    if state is None:
+    set_precision(config)
+    states = together([run], config, Display(config.trials, 0))
+    if states is None:
         raise RunError(f"{run} has no whole checkpoint yet")
-    return config, build(config), state
+    return config, build(config), part(states, 0)
 
 
 def evaluate_run(run: Path, episodes: int, seed: int) -> dict[str, Any]:
     """How the newest policy of a run does on its plant, and the run's fingerprint."""
     _, experiment, state = newest(run)
-    result = evaluate(jax.random.key(seed), state, experiment.task, Jitted(experiment.episode), episodes)
+    program = Program(experiment, 1)
+    params = jax.tree.map(lambda leaf: leaf[None], state.policy.params)
+    keys = jax.random.key(seed)[None]
+    (result,) = evaluate(keys, params, experiment.task, partial(program, "episode"), episodes)
     return {"trial": int(state.trial), "episodes": episodes, **result, "fingerprint": checkpoint.fingerprint(state)}
 
 
@@ -214,12 +226,15 @@ def scalars(board: SummaryWriter, row: dict[str, Any]) -> None:
             board.add_scalar(name, value, row["trial"])
 
 
-def summary(row: dict[str, Any], trials: int) -> str:
-    """A trial in one line."""
-    seconds = sum(row["seconds"].values())
+def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
+    """A trial in one line; the means over the seeds, when there are several."""
+    mean = {name: np.mean([row[name] for row in rows]) for name in ("mean_cost", "success_rate", "objective_last")}
+    first, skipped = rows[0], sum(row["skipped_updates"] for row in rows)
+    solved = sum(row["success_rate"] >= 0.9 for row in rows)
     return (
-        f"trial {row['trial']:>2}/{trials}  {row['plant_seconds']:6.1f} s of plant  cost {row['mean_cost']:.3f}"
-        f"  success {row['success_rate']:4.0%}  imagined {row['objective_last']:.3f}"
-        f"  ({seconds:.0f} s, {row['seconds']['compile']:.0f} s of it compiling)"
-        + (f"  {row['skipped_updates']} updates skipped" if row["skipped_updates"] else "")
+        f"trial {first['trial']:>2}/{trials}  {first['plant_seconds']:6.1f} s of plant  cost {mean['mean_cost']:.3f}"
+        f"  success {mean['success_rate']:4.0%}  imagined {mean['objective_last']:.3f}"
+        + (f"  {solved} of {len(rows)} seeds solved" if len(rows) > 1 else "")
+        + f"  ({sum(first['seconds'].values()):.0f} s, {first['seconds']['compile']:.0f} s of it compiling)"
+        + (f"  {skipped} updates skipped" if skipped else "")
     )

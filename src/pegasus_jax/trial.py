@@ -2,28 +2,26 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from pegasus_jax import dataset, episode
-from pegasus_jax.fit import FitInfo, fit
-from pegasus_jax.rollout import NoiseUse, rollout
-from pegasus_jax.scenarios import Blocks, draw, redraw
-from pegasus_jax.search import SearchInfo, objective, optimise
+from pegasus_jax.fit import FitInfo
+from pegasus_jax.search import SearchInfo
 from pegasus_jax.types import (
     Array,
     Dynamics,
     Experiment,
+    Fitter,
     Key,
     Learner,
     Params,
-    Period,
     Policy,
     Rollout,
     RunState,
+    Searcher,
     Task,
     Trajectory,
 )
@@ -51,30 +49,23 @@ def experiment(
     task: Task,
     dynamics: Dynamics,
     policy: Policy,
-    blocks: Blocks,
-    period: Period,
-    match: Callable[[Array, Array], Array],
-    cost: Callable[[Array], Array],
-    aggregate: Callable[[Array], Array],
-    noise: NoiseUse,
-    fit_optimizer: optax.GradientTransformation,
+    fit: Fitter,
     fit_steps: int,
-    fit_batch: int,
-    fit_reset: bool,
-    search_optimizer: optax.GradientTransformation,
+    search: Searcher,
     search_steps: int,
     search_reset: bool,
     search_restart: bool,
+    imagine: Callable[[Key, Params, Params], tuple[Rollout, Array]],
     explore: Callable[[Key], Array],
     explore_trials: int,
     mean_execution: bool,
     capacity: int,
 ) -> Experiment:
-    """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned."""
+    """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned.
+
+    `imagine(key, policy parameters, belief)` rolls out fresh scenarios -> (rollout, cost [H, K]).
+    """
     states, controls = len(task.state_names), len(task.control_names)
-    pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, match=match, noise=noise)
-    imagined_cost = partial(objective, **pieces, cost=cost, aggregate=aggregate)
-    scenario: dict[str, Any] = dict(blocks=blocks, period=period)
 
     def init(key: Key) -> RunState:
         model_key, policy_key = jax.random.split(jax.random.fold_in(key, 0))
@@ -82,8 +73,8 @@ def experiment(
         return RunState(
             key,
             dataset.empty(capacity, states, controls),
-            Learner(model, fit_optimizer.init(model)),
-            Learner(controller, search_optimizer.init(controller)),
+            Learner(model, fit.init(model)),
+            Learner(controller, search.init(controller)),
             jnp.int32(0),
         )
 
@@ -111,22 +102,12 @@ def experiment(
 
     def learn(state: RunState, steps: int = fit_steps) -> tuple[RunState, FitInfo]:
         """Fit the model to the data (Alg. 1 line 5)."""
-        learner = state.model
-        if fit_reset:
-            learner = Learner(learner.params, fit_optimizer.init(learner.params))
-        learner, info = fit(
-            trial_key(state.key, state.trial, FIT),
-            learner,
-            state.data,
-            prepare=dynamics.prepare,
-            loss=dynamics.loss,
-            optimizer=fit_optimizer,
-            steps=steps,
-            batch=fit_batch,
-        )
+        learner, info = fit.run(trial_key(state.key, state.trial, FIT), state.model, state.data, steps)
         return state._replace(model=learner), info
 
-    def search(state: RunState, first: Array | int = 0, steps: int = search_steps) -> tuple[RunState, SearchInfo]:
+    def improve_policy(
+        state: RunState, first: Array | int = 0, steps: int = search_steps
+    ) -> tuple[RunState, SearchInfo]:
         """Improve the policy in imagination (Alg. 1 line 6), from iteration `first` of the trial's search."""
         key = trial_key(state.key, state.trial, SEARCH)
         belief = dynamics.condition(state.model.params, state.data)
@@ -136,19 +117,10 @@ def experiment(
             params = learner.params
             if search_restart:
                 params = restarted(key, params, belief, policy.init(trial_key(state.key, state.trial, RESTART)))
-            return Learner(params, search_optimizer.init(params)) if search_reset else learner._replace(params=params)
+            return Learner(params, search.init(params)) if search_reset else learner._replace(params=params)
 
-        learner, info = optimise(
-            key,
-            jax.lax.cond(jnp.asarray(first) == 0, begin, lambda learner: learner, state.policy),
-            belief,
-            draw=partial(draw, **scenario),
-            redraw=partial(redraw, **scenario),
-            objective=imagined_cost,
-            optimizer=search_optimizer,
-            steps=steps,
-            first=first,
-        )
+        learner = jax.lax.cond(jnp.asarray(first) == 0, begin, lambda learner: learner, state.policy)
+        learner, info = search.run(key, learner, belief, first=first, steps=steps)
         return state._replace(policy=learner), info
 
     def restarted(key: Key, params: Params, belief: Params, fresh: Params) -> Params:
@@ -157,24 +129,23 @@ def experiment(
         A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, so a policy
         that knows nothing is the better start. A tie goes to the fresh one; a model that imagines NaN changes nothing.
         """
-        scenarios = draw(key, 0, belief, **scenario)
         candidates = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, fresh)
-        kept, new = jax.vmap(imagined_cost, (0, None, None))(candidates, belief, scenarios)
+        kept, new = jax.vmap(search.value, (None, 0, None))(key, candidates, belief)
         return jax.tree.map(partial(jnp.where, new <= kept), fresh, params)
 
     def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
         state, fitted = learn(state)
-        state, searched = search(state)
+        state, searched = improve_policy(state)
         return state, (fitted, searched)
 
-    def imagine(state: RunState) -> tuple[Rollout, Array]:
+    def look_ahead(state: RunState) -> tuple[Rollout, Array]:
         """Rollouts of the policy under scenarios the search has not seen, and their costs [H, K]."""
         belief = dynamics.condition(state.model.params, state.data)
-        fresh = draw(trial_key(state.key, state.trial, IMAGINE), 0, belief, **scenario)
-        imagined = rollout(state.policy.params, belief, fresh, **pieces)
-        return imagined, cost(imagined.seen)
+        return imagine(trial_key(state.key, state.trial, IMAGINE), state.policy.params, belief)
 
-    return Experiment(task, dynamics, policy, init, one_episode, collect, absorb, learn, search, improve, imagine)
+    return Experiment(
+        task, dynamics, policy, init, one_episode, collect, absorb, learn, improve_policy, improve, look_ahead
+    )
 
 
 def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunState, TrialInfo]:

@@ -99,6 +99,8 @@ class Dynamics(NamedTuple):
     condition: Callable[[Params, Dataset], Any]  # -> belief, all that a rollout needs
     sample: Callable[[Key, Any], Params]  # (key, belief) -> draw: one function, one particle's w^(k)
     apply: Callable[[Any, Params, Array, Array], Prediction]  # (belief, draw, x [D], u [U])
+    # (belief, mean [F + U], cov of (encoded state, control)) -> gaussian.Image of the change of state; None: not known
+    moments: Callable[[Any, Array, Array], Any] | None = None
 
 
 class Policy(NamedTuple):
@@ -107,6 +109,8 @@ class Policy(NamedTuple):
     init: Callable[[Key], Params]
     sample: Callable[[Key], Params]  # base noise of one policy draw
     apply: Callable[[Params, Params, Array], Array]  # (params, noise or None: the mean policy, x [D]) -> u [U]
+    # (params, mean [F], cov of the encoded state) -> gaussian.Image of the control; None: not known
+    moments: Callable[[Params, Array, Array], Any] | None = None
 
 
 class Task(NamedTuple):
@@ -128,6 +132,8 @@ class Task(NamedTuple):
     state_names: tuple[str, ...]
     control_names: tuple[str, ...]
     success: float = 0.2  # a rollout whose last five steps cost less than this on average has succeeded
+    # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not known in closed form
+    expected_cost: Callable[[Array, Array], Array] | None = None
 
 
 class Learner(NamedTuple):
@@ -135,6 +141,21 @@ class Learner(NamedTuple):
 
     params: Params
     optimizer: Any
+
+
+class Fitter(NamedTuple):
+    """How a model learns from the data (Alg. 1 line 5)."""
+
+    init: Callable[[Params], Any]  # parameters -> the optimiser's state
+    run: Callable[..., tuple[Learner, Any]]  # (key, learner, data, steps) -> (learner, FitInfo)
+
+
+class Searcher(NamedTuple):
+    """How a policy improves in imagination (Alg. 1 line 6)."""
+
+    init: Callable[[Params], Any]  # parameters -> the optimiser's state
+    run: Callable[..., tuple[Learner, Any]]  # (key, learner, belief, first=, steps=) -> (learner, SearchInfo)
+    value: Callable[[Key, Params, Any], Array]  # (key, parameters, belief) -> the cost that iteration 0 of `run` sees
 
 
 class RunState(NamedTuple):

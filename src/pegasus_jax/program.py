@@ -1,0 +1,135 @@
+"""The compiled parts of an experiment, for one seed or for many at once, and the clock on them."""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
+
+from pegasus_jax import mesh
+from pegasus_jax.types import Experiment
+
+NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
+
+
+class Jitted:
+    """A jitted function that says how long compiling took; compiles once, or it is a defect."""
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
+
+    def __call__(self, *arguments: Any) -> Any:
+        if self.compiled is None:
+            began = time.monotonic()
+            self.compiled = self.function.lower(*arguments).compile()
+            self.seconds = time.monotonic() - began
+        return jax.block_until_ready(self.compiled(*arguments))
+
+
+class Program:
+    """An experiment over S seeds: every argument and result has a leading axis [S], except those that all share.
+
+    With a mesh, the seeds lie on its devices; those of several processes call every part together.
+    """
+
+    def __init__(self, experiment: Experiment, search_steps: int, seeds: int = 1, over: Mesh | None = None) -> None:
+        self.mesh = over
+        self.chunk = chunk(search_steps)
+        self.chunks = search_steps // self.chunk
+        functions = {
+            "init": (experiment.init, (0,)),
+            "episode": (experiment.episode, (0, 0, None)),
+            "absorb": (experiment.absorb, (0, 0)),
+            "fit": (experiment.fit, (0,)),
+            "search": (partial(experiment.search, steps=self.chunk), (0, None)),
+            "imagine": (experiment.imagine, (0,)),
+        }
+        self.axes = {name: axes for name, (_, axes) in functions.items()}
+        self.parts = {
+            name: Jitted(
+                over_seeds(function, axes, seeds=seeds),
+                **({} if over is None else {"out_shardings": mesh.over_seeds(over)}),
+            )
+            for name, (function, axes) in functions.items()
+        }
+        self.spent: dict[str, float] = {}
+
+    def __call__(self, part: str, *arguments: Any, purpose: str | None = None) -> Any:
+        """Run a part; its time is counted as that of `purpose`."""
+        jitted, name = self.parts[part], purpose or part
+        if self.mesh is not None:
+            layouts = [mesh.shared(self.mesh) if a is None else mesh.over_seeds(self.mesh) for a in self.axes[part]]
+            arguments = tuple(placed(*pair) for pair in zip(arguments, layouts, strict=True))
+        began, compiled = time.monotonic(), jitted.seconds
+        result = jitted(*arguments)
+        compiling = jitted.seconds - compiled
+        self.spent[name] = self.spent.get(name, 0.0) + time.monotonic() - began - compiling
+        self.spent["compile"] = self.spent.get("compile", 0.0) + compiling
+        return result
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds spent in each part since the last call."""
+        spent, self.spent = self.spent, {}
+        return {name: round(spent.get(name, 0.0), 3) for name in NAMES}
+
+
+def over_seeds(function: Callable[..., Any], axes: tuple[int | None, ...], *, seeds: int) -> Callable[..., Any]:
+    """The function over a leading axis of `seeds`; one seed is the function itself, so that its numbers do not change.
+
+    `axes` is 0 for an argument with that axis, None for one that all seeds share.
+    """
+    if seeds > 1:
+        return jax.vmap(function, axes, spmd_axis_name=mesh.SEEDS)
+
+    def alone(*arguments: Any) -> Any:
+        own = (
+            argument if axis is None else jax.tree.map(lambda leaf: leaf[0], argument)
+            for argument, axis in zip(arguments, axes, strict=True)
+        )
+        return jax.tree.map(lambda leaf: leaf[None], function(*own))
+
+    return alone
+
+
+def placed(tree: Any, layout: NamedSharding) -> Any:
+    """The tree's arrays laid out over devices; arrays that other processes hold too are equal there."""
+
+    def put(leaf: Any) -> Any:
+        if isinstance(leaf, jax.Array) and leaf.sharding.is_equivalent_to(layout, leaf.ndim):
+            return leaf
+        if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable:
+            return jax.device_put(leaf, layout)
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(put(np.asarray(jax.random.key_data(leaf))))
+        return jax.device_put(np.asarray(leaf), layout)
+
+    return jax.tree.map(put, tree)
+
+
+def fetched(tree: Any) -> Any:
+    """The tree's arrays whole on this process, whatever devices of whatever process hold them."""
+    if jax.process_count() == 1:
+        return tree
+
+    def get(leaf: Any) -> Any:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(get(jax.random.key_data(leaf)))
+        return jnp.asarray(multihost_utils.process_allgather(leaf, tiled=True))
+
+    return jax.tree.map(get, tree)
+
+
+def leads() -> bool:
+    """Whether this process is the one that writes files and speaks."""
+    return jax.process_index() == 0
+
+
+def chunk(steps: int) -> int:
+    """Search iterations between two looks at the clock: a divisor of `steps` near a tenth of it."""
+    divisors = [d for d in range(1, steps + 1) if steps % d == 0]
+    return next(d for d in divisors if d * 20 >= steps)

@@ -1,0 +1,165 @@
+"""Many seeds as one program: each leaves the run it would have left alone, and none disturbs another."""
+
+import json
+import signal
+import socket
+import subprocess
+import time
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_jax import record
+from pegasus_jax.build import compose
+from pegasus_jax.program import over_seeds
+from probes import cart, tiny, unchecked
+from test_train import TINY, call, fingerprint, program
+
+WORDS = [*TINY, "trials=2", "seed=1"]
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Seeds 1 and 2, together."""
+    folder = tmp_path_factory.mktemp("study") / "both"
+    done = call("train", *WORDS, "seeds=2", f"out={folder}", cwd=folder.parent)
+    assert done.returncode == 0, done.stderr
+    assert "of 2 seeds solved" in done.stderr
+    return folder
+
+
+def test_a_seed_among_others_leaves_what_it_leaves_alone(study: Path, tmp_path: Path) -> None:
+    """The same files with the same numbers, up to the order in which a batched product adds."""
+    alone, among = tmp_path / "alone", study / "seed2"
+    assert call("train", *WORDS, "seed=2", f"out={alone}", cwd=tmp_path).returncode == 0
+    files = [
+        {str(p.relative_to(run)) for p in run.rglob("*.*") if "events" not in p.name and "checkpoints/" not in str(p)}
+        for run in (alone, among)
+    ]
+    assert files[0] == files[1]
+    assert (alone / "config.yaml").read_text() == (among / "config.yaml").read_text()
+    for trial in (1, 2):
+        one, other = record.load_episode(alone, trial), record.load_episode(among, trial)
+        assert one is not None
+        assert other is not None
+        for a, b in zip(one, other, strict=True):
+            np.testing.assert_allclose(a, b, atol=2e-3)
+    for a, b in zip(record.trials(alone), record.trials(among), strict=True):
+        assert a.keys() == b.keys()
+        for name in ("mean_cost", "objective_first", "objective_last", "objective_fresh"):
+            assert a[name] == pytest.approx(b[name], abs=2e-3), name
+    assert fingerprint(study / "seed1") != fingerprint(among)
+
+
+def test_killed_and_resumed_is_bit_equal(study: Path, tmp_path: Path) -> None:
+    """Killed when one seed's second episode is on disk and the other's perhaps not."""
+    folder = tmp_path / "killed"
+    awaited = folder / "seed1" / "episodes" / "0002.npz"
+    command = [*program("train"), *WORDS, "seeds=2", f"out={folder}"]
+    process = subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 240
+    while not awaited.exists() and process.poll() is None and time.monotonic() < deadline:
+        time.sleep(0.002)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert awaited.exists()
+    done = call("train", f"resume={folder}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for seed in ("seed1", "seed2"):
+        assert fingerprint(folder / seed) == fingerprint(study / seed)
+        assert [row["trial"] for row in record.trials(folder / seed)] == [1, 2]
+
+
+def alike(study: Path, other: Path) -> None:
+    """Two folders of seeds hold the same runs, up to the order of sums."""
+    for seed in ("seed1", "seed2"):
+        for a, b in zip(record.trials(study / seed), record.trials(other / seed), strict=True):
+            for name in ("mean_cost", "objective_first", "objective_last", "objective_fresh"):
+                assert a[name] == pytest.approx(b[name], abs=2e-3), (seed, name)
+
+
+def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_path: Path) -> None:
+    """Four devices made of this processor, two for the seeds and two for the particles; resumed on one device."""
+    folder, words = tmp_path / "mesh", [*WORDS, "trials=1", "seeds=2", "mesh=2x2"]
+    done = call("train", *words, f"out={folder}", cwd=tmp_path, XLA_FLAGS="--xla_force_host_platform_device_count=4")
+    assert done.returncode == 0, done.stderr
+    assert call("train", f"resume={folder}", "trials=2", cwd=tmp_path).returncode == 0
+    alike(study, folder)
+
+
+def test_processes_that_act_as_one_machine_change_nothing(study: Path, tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    words = [*WORDS, "seeds=2", f"out={tmp_path / 'shared'}", f"coordinator=localhost:{port}", "processes=2"]
+    command = [*program("train"), *words]
+    both = [
+        subprocess.Popen([*command, f"process={i}"], cwd=tmp_path, stderr=subprocess.PIPE, text=True) for i in range(2)
+    ]
+    errors = [process.communicate(timeout=300)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], errors
+    assert "trial  2/2" in errors[0]
+    assert "trial" not in errors[1]  # one speaks
+    alike(study, tmp_path / "shared")
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("mesh=2x1", "needs 2 devices"),
+        ("mesh=3x1", "mesh=1x1"),
+        ("mesh=two", "mesh=4x1"),
+        ("processes=2", "coordinator=HOST:PORT"),
+        ("distributed=maybe", "neither true nor false"),
+        ("distributed=true", "coordinator=HOST:PORT"),  # no SLURM and no MPI here
+    ],
+)
+def test_devices_that_are_not_there_are_one_clear_line(word: str, message: str, tmp_path: Path) -> None:
+    done = call("train", *WORDS, "seeds=2", word, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert message in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_of_seeds_is_drawn_and_kept(study: Path) -> None:
+    plotted = call("plot", study, cwd=study.parent)
+    assert plotted.returncode == 0, plotted.stderr
+    assert (study / "learning.png").read_bytes().startswith(b"\x89PNG")
+    again = call("train", *WORDS, "seeds=2", f"out={study}", cwd=study.parent)
+    assert (again.returncode, again.stderr.count("\n")) == (2, 1)
+    assert f"resume={study}" in again.stderr
+    named = call("evaluate", study, cwd=study.parent)
+    assert named.returncode == 2
+    assert "seed1" in named.stderr
+    evaluated = call("evaluate", study / "seed2", "episodes=1", "json=true", cwd=study.parent)
+    assert json.loads(evaluated.stdout)["trial"] == 2
+
+
+def test_one_environment_on_the_host_has_one_seed(tmp_path: Path) -> None:
+    words = ["task=gym", "env=Pendulum-v1", "cost=math:cos", "seeds=2"]
+    done = call("train", *words, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+    assert "seeds=2" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_seed_that_diverges_leaves_the_others_as_they_are() -> None:
+    """One seed's data turns to NaN: its own updates are skipped, the other's parameters are bit-equal."""
+    exp = compose(tiny(trials=1, fit__steps=5, search__steps=5), cart())
+    over = jax.jit(over_seeds(exp.init, (0,), seeds=2)), jax.jit(over_seeds(exp.improve, (0,), seeds=2))
+    init, improve = map(unchecked, over)
+    states = init(jnp.stack([jax.random.key(0), jax.random.key(1)]))
+    collect = unchecked(jax.jit(over_seeds(exp.collect, (0,), seeds=2)))
+    absorb = jax.jit(over_seeds(exp.absorb, (0, 0), seeds=2))
+    states = absorb(states, collect(states))
+    poisoned = states._replace(data=states.data._replace(y=states.data.y.at[1].set(jnp.nan)))
+    (healthy, _), (mixed, info) = improve(states), improve(poisoned)
+    for a, b in zip(jax.tree.leaves(healthy.policy), jax.tree.leaves(mixed.policy), strict=True):
+        np.testing.assert_array_equal(a[0], b[0])
+    fitted, searched = info
+    assert np.array_equal(fitted.skipped, [0, 5])
+    assert searched.skipped[0] == 0
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(mixed.policy.params))
