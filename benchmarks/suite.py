@@ -152,9 +152,9 @@ COLUMNS = (
 
 def table(rows: dict[str, Row]) -> str:
     """The rows as text."""
-    lines = [f"{'':36s}" + "".join(f"{name:>16s}" for name in COLUMNS)]
+    lines = [f"{'':44s}" + "".join(f"{name:>16s}" for name in COLUMNS)]
     for name, row in rows.items():
-        lines.append(f"{name:36s}" + "".join(f"{row[c]:16.3g}" if c in row else f"{'':16s}" for c in COLUMNS))
+        lines.append(f"{name:44s}" + "".join(f"{row[c]:16.3g}" if c in row else f"{'':16s}" for c in COLUMNS))
     return "\n".join(lines)
 
 
