@@ -285,7 +285,7 @@ class Analytic:
     """Policy search after each fit, PILCO's: L-BFGS on the expected cost of a Gaussian, propagated analytically."""
 
     kind: str = setting("analytic", "")
-    steps: int = setting(100, "iterations of L-BFGS a trial")
+    steps: int = setting(300, "iterations of L-BFGS a trial, at most")
     particles: int = setting(100, "K, rollouts imagined afterwards for the record; the search has none")
     aggregate: str = setting("mean", "over the horizon: mean, or total, PILCO's sum")
     discount: float = setting(1.0, "weight of a later step against the one before")
