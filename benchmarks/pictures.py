@@ -1,14 +1,16 @@
 """The pictures of the documentation, drawn from a run and from the stored results.
 
     python -m benchmarks.pictures [run=runs/cartpole-seed0]
+    python -m benchmarks.pictures plants
 
-Writes docs/pictures/swingup.png (a learned episode, frame by frame) and copies the learning curve of
-benchmarks/results/cartpole.png beside it.
+Writes docs/pictures/cartpoles.png and swimmer.png: every plant, at its start and at its goal. With a run also
+swingup.png (a learned episode, frame by frame), and the learning curve of benchmarks/results/cartpole.png beside it.
 """
 
 import shutil
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,12 +22,58 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks.study import RESULTS
+from pegasus_envs.cartpole import cartpole
+from pegasus_envs.double_cartpole import double_cartpole
+from pegasus_envs.goals import Task
+from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames
+from pegasus_envs.swimmer import swimmer
 from pegasus_jax import settings
 from pegasus_jax.record import existing
 from pegasus_jax.train import newest
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
+
+
+def poses() -> dict[str, list[tuple[str, Plant, Any]]]:
+    """File -> title, plant and x of each of its pictures."""
+    upright, hanging = np.pi, np.zeros(4)
+    cart, double = cartpole(), double_cartpole()
+    hips = 0.5 * np.sin(np.arange(6) * 2.0)
+
+    def swims(task: Task, roll: float, pitch: float = 0.0, depth: float = 1.0) -> tuple[str, Plant, Any]:
+        x = np.concatenate([[roll, pitch, 0.0, depth, 0.0, 0.0, 0.0], hips])
+        return task.replace("_", " "), swimmer(task, 6), x
+
+    return {
+        "cartpoles.png": [
+            ("cart-pole: start", cart, hanging),
+            ("goal", cart, np.array([0.0, 0.0, 0.0, upright])),
+            ("double cart-pole: start", double, double.start_mean),
+            ("on the way", double, np.array([0.3, 0.0, 0.0, 0.0, 0.6, -1.0])),
+            ("goal", double, np.zeros(6)),
+        ],
+        "swimmer.png": [
+            swims("knife_edge", np.pi / 2),
+            swims("belly_up", np.pi),
+            swims("corkscrew", -0.8),
+            swims("depth_change", 0.0, 0.5, 1.6),
+        ],
+    }
+
+
+def plants() -> None:
+    """Draw every plant of pegasus_envs."""
+    for name, row in poses().items():
+        figure, axes = plt.subplots(1, len(row), figsize=(2.4 * len(row), 2.1), dpi=80)
+        for axis, (title, plant, x) in zip(axes, row, strict=True):
+            (picture,) = frames(plant, [plant.place(jnp.asarray(x, jnp.float32))], 280, 220)
+            axis.imshow(picture)
+            axis.set_title(title, fontsize=9)
+            axis.axis("off")
+        figure.tight_layout(pad=0.2)
+        figure.savefig(PICTURES / name, bbox_inches="tight")
+        plt.close(figure)
 
 
 def swing_up(run: Path, path: Path, shown: int = 9) -> None:
@@ -47,8 +95,11 @@ def swing_up(run: Path, path: Path, shown: int = 9) -> None:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, _ = settings.split(words, ("run",))
     PICTURES.mkdir(parents=True, exist_ok=True)
+    plants()
+    if words == ["plants"]:
+        return
+    options, _ = settings.split(words, ("run",))
     swing_up(Path(options.get("run", "runs/cartpole-seed0")), PICTURES / "swingup.png")
     shutil.copy(RESULTS / "cartpole.png", PICTURES / "cartpole.png")
 

@@ -54,6 +54,7 @@ def cart(horizon: int = 8) -> Task:
         dt=dt,
         state_names=("x", "v"),
         control_names=("u",),
+        expected_cost=cost.expected_saturating(lambda x: x, 1.0, ()),
     )
 
 
@@ -67,6 +68,9 @@ def dial(horizon: int = 6) -> Task:
     def seen(angle):
         return jnp.arctan2(jnp.sin(angle), jnp.cos(angle))
 
+    def error(x):
+        return jnp.array([jnp.cos(x[0]) - np.cos(goal), jnp.sin(x[0]) - np.sin(goal)])
+
     return Task(
         name="dial",
         plant=Plant(
@@ -74,7 +78,7 @@ def dial(horizon: int = 6) -> Task:
             lambda angle, u: angle + 0.8 * u,
             seen,
         ),
-        cost=cost.saturating(lambda x: jnp.array([jnp.cos(x[0]) - np.cos(goal), jnp.sin(x[0]) - np.sin(goal)]), 0.5),
+        cost=cost.saturating(error, 0.5),
         angles=(0,),
         start_mean=np.array([2.5]),
         start_std=np.array([0.2]),
@@ -85,6 +89,7 @@ def dial(horizon: int = 6) -> Task:
         dt=1.0,
         state_names=("angle",),
         control_names=("turn",),
+        expected_cost=cost.expected_saturating(error, 0.5, (0,)),
     )
 
 

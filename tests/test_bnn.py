@@ -79,7 +79,7 @@ def test_the_loss_is_eq_2_over_n(kind, heteroscedastic, full):
 
 
 def test_binary_dropout_thins_the_weight_prior_of_the_layers_it_acts_on():
-    """Reference settings 4.4: half p_keep |W|^2; the first layer, whose inputs carry no noise, keeps all of it."""
+    """docs/reference.md 4.4: half p_keep |W|^2; the first layer, whose inputs carry no noise, keeps all of it."""
     data, model = experience(), network("binary", weight_decay=1.0)
     plain = network("binary", weight_decay=0.0)
     params = jax.jit(model.init)(jax.random.key(0))

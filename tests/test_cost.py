@@ -1,12 +1,22 @@
 """Costs: the saturating form, and what is made of the costs of many particles."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax import cost
+from pegasus_envs.cartpole import cartpole
+from pegasus_envs.double_cartpole import double_cartpole
+from pegasus_envs.swimmer import swimmer
+from pegasus_jax import cost, tasks
+from pegasus_jax.angles import encode
+from pegasus_jax.gaussian import sincos
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
 
 COSTS = np.random.default_rng(0).uniform(size=(6, 4)).astype(np.float32)  # [H, K]
 number = st.floats(-5, 5, width=32)
@@ -44,3 +54,102 @@ def test_discount_weighs_each_step_against_the_one_before(discount):
     expected = sum(discount**t * COSTS[t].mean() for t in range(6))
     np.testing.assert_allclose(cost.discounted(discount, cost.total)(COSTS), expected, rtol=1e-5)
     np.testing.assert_allclose(cost.discounted(discount, cost.mean)(COSTS), expected / 6, rtol=1e-5)
+
+
+def test_the_worst_particles_by_a_sort():
+    """Where the fraction is no whole number of particles, the last counts in part."""
+    episodes = COSTS.mean(0)
+    order = np.argsort(-episodes)
+    for fraction, weights in ((0.25, [1, 0, 0, 0]), (0.5, [1, 1, 0, 0]), (0.6, [1, 1, 0.4, 0]), (1.0, [1, 1, 1, 1])):
+        expected = np.sum(np.array(weights) * episodes[order]) / np.sum(weights)
+        np.testing.assert_allclose(cost.worst(fraction)(COSTS), expected, rtol=1e-6)
+        np.testing.assert_allclose(cost.worst(fraction, cost.total)(COSTS), 6 * expected, rtol=1e-6)
+
+
+def test_only_the_worst_particles_have_a_gradient():
+    gradient = np.asarray(jax.grad(cost.worst(0.5))(jnp.asarray(COSTS)))
+    worst = np.argsort(-COSTS.mean(0))[:2]
+    np.testing.assert_allclose(gradient[:, worst], 1 / 12, rtol=1e-6)
+    assert not np.any(np.delete(gradient, worst, 1))
+
+
+def test_the_worst_by_discounted_cost():
+    """The particle that is worst at first is not the one that is worst on the whole."""
+    costs = jnp.array([[1.0, 0.0], [0.0, 0.9], [0.0, 0.9]])
+    assert float(cost.worst(0.5, cost.total)(costs)) == pytest.approx(1.8)
+    assert float(cost.discounted(0.1, cost.worst(0.5, cost.total))(costs)) == pytest.approx(1.0)
+
+
+# Expected costs. Every task of the package has an error that is affine in the features
+
+PLANTS = {
+    "cartpole": cartpole,
+    "double_cartpole": double_cartpole,
+    **{
+        f"swimmer_{goal}_{legs}": partial(swimmer, goal, legs)
+        for goal in ("knife_edge", "belly_up", "corkscrew", "depth_change")
+        for legs in (2, 6)
+    },
+}
+every_plant = pytest.mark.parametrize("name", PLANTS)
+GOALS = {
+    "cartpole": [0, 0, 0, np.pi],
+    "double_cartpole": np.zeros(6),
+    "swimmer_knife_edge_2": [np.pi / 2, 0, 0, 1, 0, 0, 0],
+    "swimmer_belly_up_2": [np.pi, 0, 0, 1, 0, 0, 0],
+    "swimmer_corkscrew_2": [0.7, 0, 0, 1, -2 * np.pi / 3, 0, 0],
+    "swimmer_depth_change_2": [0, 0, 0, 2, 0, 0, 0],
+}
+
+
+@every_plant
+def test_the_error_is_its_affine_form(name, x64):
+    plant = PLANTS[name]()
+    states = len(plant.state_names)
+    matrix, offset = cost.affine_error(plant.error, states, plant.angles)
+    x = 3 * np.random.default_rng(0).normal(size=(20, states))
+    expected = encode(jnp.asarray(x), plant.angles) @ matrix.T + offset
+    np.testing.assert_allclose(jax.vmap(plant.error)(x), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", GOALS)
+def test_the_expected_cost_against_samples(name, x64):
+    """Of features that are Gaussian; and of a Gaussian state, whose sines and cosines nearly are for small angles."""
+    plant, count = PLANTS[name](), 200_000
+    noise = np.random.default_rng(1)
+    states = len(plant.state_names)
+    root = 0.1 * noise.normal(size=(states, states))
+    mean, cov = np.array(GOALS[name]) + 0.1 * noise.normal(size=states), root @ root.T * plant.width
+
+    @jax.jit
+    def moments(mean, cov):
+        features = sincos(mean, cov, plant.angles)
+        expected = cost.expected_saturating(plant.error, plant.width, plant.angles)(mean, cov)
+        return features.mean, features.cov, cost.affine_error(plant.error, states, plant.angles), expected
+
+    feature_mean, feature_cov, (matrix, offset), expected = moments(mean, cov)
+    draws = noise.multivariate_normal(feature_mean, feature_cov, count, method="svd")
+    costs = 1 - np.exp(-0.5 * np.sum((draws @ np.asarray(matrix).T + offset) ** 2, 1) / plant.width**2)
+    assert 0.02 < costs.mean() < 0.9
+    assert float(expected) == pytest.approx(costs.mean(), abs=5 * costs.std() / count**0.5)
+    x = noise.multivariate_normal(mean, cov, count)
+    of_states = jax.jit(jax.vmap(cost.saturating(plant.error, plant.width)))(x)
+    assert float(expected) == pytest.approx(float(of_states.mean()), abs=0.02)
+
+
+def test_the_cost_of_a_task_and_its_expectation_agree_where_the_state_is_known(x64):
+    task = tasks.make("double_cartpole")
+    x = np.random.default_rng(2).normal(size=(20, 6)) * 0.3
+    assert task.expected_cost is not None
+    known = jax.jit(jax.vmap(task.expected_cost, (0, None)))(x, np.zeros((6, 6)))
+    np.testing.assert_allclose(known, jax.vmap(task.cost)(x), atol=1e-12)
+
+
+def test_the_matched_cost_is_that_of_the_particles_gaussian(x64):
+    expected = cost.expected_saturating(lambda x: jnp.array([x[0] - jnp.cos(x[1])]), 0.7, (1,))
+    x = np.random.default_rng(3).normal(size=(3, 9, 2))
+    matched = jax.jit(cost.of_matched(expected))(x)
+    expected = jax.jit(expected)
+    assert matched.shape == (3, 1)
+    for t in range(3):
+        np.testing.assert_allclose(matched[t, 0], expected(x[t].mean(0), np.cov(x[t].T)), rtol=1e-10)

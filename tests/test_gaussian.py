@@ -308,7 +308,7 @@ def test_saturating_cost_against_samples():
 
 
 def test_saturating_cost_agrees_with_the_form_of_the_authors():
-    """Reference settings 1.3: a quadratic form of all features, instead of the error's few dimensions."""
+    """docs/reference.md 1.3: a quadratic form of all features, instead of the error's few dimensions."""
     target = np.linalg.lstsq(MATRIX, -OFFSET)[0]
     quadratic = MATRIX.T @ MATRIX / 0.7**2
     ratio = np.eye(D) + COV @ quadratic

@@ -73,6 +73,35 @@ def test_a_guest_obeys_gymnasium() -> None:
     np.testing.assert_array_equal(run(jax.random.key(4))[1], xs)
 
 
+class Fragile(gymnasium.Env):
+    """Counts its steps, ends at the third, and breaks when it is stepped on."""
+
+    action_space = gymnasium.spaces.Box(-1, 1, (1,))
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        self.count = 0
+        return np.zeros(1), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        assert self.count < 3, "stepped after its end"
+        self.count += 1
+        return np.full(1, self.count), 0.0, self.count == 3, False, {}
+
+
+def test_an_environment_rests_once_it_has_ended() -> None:
+    gymnasium.register("Fragile-v0", Fragile)
+    plant = guest("Fragile-v0")
+
+    @jax.jit
+    def run(key: jax.Array) -> jax.Array:
+        step = lambda x, _: (plant.step(x, jax.numpy.zeros(1)),) * 2  # noqa: E731
+        return jax.lax.scan(step, plant.reset(key), None, length=6)[1][:, 0]
+
+    for seed in range(2):  # a reset begins anew
+        np.testing.assert_array_equal(run(jax.random.key(seed)), [1, 2, 3, 3, 3, 3])
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [

@@ -15,8 +15,8 @@ ROOT = Path(__file__).resolve().parents[1]
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
     0: "types config",
-    1: "angles dropout whiten moments gaussian cost dataset scenarios rollout episode",
-    2: "network kernel fit lbfgs search",
+    1: "angles mesh dropout whiten moments gaussian cost dataset scenarios rollout episode",
+    2: "network kernel fit lbfgs search pilco",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",
@@ -27,8 +27,14 @@ TOP = max(LAYERS)  # the layer that is an application: here modules may import e
 # (importer, imported), both of one layer below TOP.
 SIBLINGS: set[tuple[str, str]] = {
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
+    ("cost", "gaussian"),  # the expected cost of a Gaussian state
+    ("cost", "moments"),  # of the Gaussian with the particles' mean and covariance
+    ("scenarios", "mesh"),  # where the particles that it draws lie
     ("scenarios", "moments"),  # the noise of moment matching is drawn standardised
+    ("pilco", "lbfgs"),  # one L-BFGS for model and policy
+    ("pilco", "search"),  # and one report of how a search went
     ("lbfgs", "fit"),  # what every fit reports
+    ("policy.external", "policy.squash"),  # every controller saturates the same ways
     ("search", "fit"),  # one guarded optimiser, one count of skipped updates
 }
 

@@ -13,7 +13,7 @@ from pegasus_jax import moments
 from pegasus_jax.rollout import NoiseUse, rollout
 from pegasus_jax.scenarios import draw
 from pegasus_jax.types import Dynamics, Period, Policy, Prediction, Scenarios
-from probes import rig
+from probes import PENDULUM, known, linear_policy, rig
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
@@ -190,3 +190,45 @@ def test_no_gradient_flows_through_the_predicted_noise(factor):
     assert value(params, 0.0) != value(2 * params, 0.0)  # the noise does depend on the parameters
     assert gradient(params, 0.0) == 0
     assert gradient(params, 0.1) != 0
+
+
+# Truncated back-propagation
+
+
+def truncated(truncate):
+    """(states, gradient of the mean square) of a linear plant under a linear policy, as a function of its gain."""
+    dynamics, policy = known(PENDULUM), linear_policy(2, 1)
+    none = jnp.zeros((6, 3, 2))
+    given = Scenarios(jax.random.normal(jax.random.key(0), (3, 2)), jnp.zeros(3), jnp.zeros(3), none, none)
+
+    def value(gain):
+        x = rollout(gain, None, given, dynamics=dynamics, policy=policy, match=moments.keep, truncate=truncate).x
+        return jnp.mean(x[1:] ** 2), x
+
+    gain = jnp.array([[-0.4, -1.1]])
+    gradient, x = jax.jit(jax.grad(value, has_aux=True))(gain)
+    return np.asarray(x), np.asarray(gradient), np.asarray(gain)
+
+
+@pytest.mark.parametrize("truncate", [1, 2, 4])
+def test_truncation_is_the_gradient_with_states_held_at_the_cuts(truncate, x64):
+    """By hand: each stretch starts at a state that does not depend on the gain."""
+    x, gradient, gain = truncated(truncate)
+    plain, whole, _ = truncated(None)
+    np.testing.assert_array_equal(x, plain)  # what is imagined does not change
+
+    def stretches(gain):
+        total = 0.0
+        for t in range(0, 6, truncate):
+            state = jnp.asarray(x[t])
+            for _ in range(t, min(t + truncate, 6)):
+                state = state @ (PENDULUM.a + PENDULUM.b @ gain).T
+                total += jnp.sum(state**2)
+        return total / 36
+
+    np.testing.assert_allclose(gradient, jax.grad(stretches)(jnp.asarray(gain)), rtol=1e-9)
+    assert not np.allclose(gradient, whole)
+
+
+def test_a_cut_beyond_the_horizon_cuts_nothing(x64):
+    np.testing.assert_allclose(truncated(6)[1], truncated(None)[1], rtol=1e-12)

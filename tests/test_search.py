@@ -14,8 +14,8 @@ from scipy.optimize import minimize
 from pegasus_jax import cost, moments, scenarios
 from pegasus_jax.fit import guarded
 from pegasus_jax.rollout import NoiseUse
-from pegasus_jax.search import objective, optimise
-from pegasus_jax.types import Learner, Period, Scenarios
+from pegasus_jax.search import keeping_best, objective, optimise, remembering
+from pegasus_jax.types import Learner, Period, Scenarios, Searcher
 from probes import (
     PENDULUM,
     SCALAR,
@@ -301,3 +301,49 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     assert same(whole, learner)
     assert np.array_equal(info.objective, np.concatenate(values))
     assert len(np.unique(info.objective)) == 6
+
+
+# The best iterate
+
+
+def seeking(optimizer, steps, value=jnp.nan, bad=(), last=12):
+    """A keeping searcher around `pursue`."""
+    init, run = optimizer.init, pursue(optimizer, steps, bad=bad, value=value)
+    searcher = Searcher(
+        init, lambda key, learner, belief, *, first, steps: run(key, learner, belief, first=first), None
+    )
+    return keeping_best(searcher, last)
+
+
+def test_the_best_iterate_is_the_one_with_the_lowest_objective_seen():
+    """One that is not the last; a search in pieces keeps the same one; NaN is no value."""
+    key = jax.random.key(7)
+    plain, remembers = guarded(optax.adam(0.3)), guarded(remembering(optax.adam(0.3)))
+    one, learner, params, values = pursue(plain, 1), begin(plain), [], []
+    for i in range(12):
+        params.append(learner.params)
+        learner, info = one(key, learner, 1.0, first=i)
+        values.append(float(info.objective[0]))
+    best = int(np.argmin(values))
+    assert 0 < best < 11
+    whole, _ = seeking(remembers, 12).run(key, begin(remembers), 1.0, first=0, steps=12)
+    np.testing.assert_allclose(whole.params, params[best], rtol=1e-5)
+    learner = begin(remembers)
+    for first in (0, 4, 8):
+        learner, _ = seeking(remembers, 4).run(key, learner, 1.0, first=first, steps=4)
+        if first < 8:  # not over: the search goes on from where it is
+            np.testing.assert_allclose(learner.params, params[first + 4], rtol=1e-4)
+    assert same(learner, whole)
+    spoiled, info = seeking(remembers, 12, bad=(best,)).run(key, begin(remembers), 1.0, first=0, steps=12)
+    assert np.isnan(info.objective[best])
+    assert np.all(np.isfinite(spoiled.params))
+    assert not np.allclose(spoiled.params, whole.params)
+
+
+def test_what_was_best_for_an_older_model_is_forgotten():
+    remembers = guarded(remembering(optax.adam(0.3)))
+    searcher = seeking(remembers, 12)
+    learner, _ = searcher.run(jax.random.key(7), begin(remembers), 1.0, first=0, steps=12)
+    start = learner.params + 3
+    again, info = searcher.run(jax.random.key(8), Learner(start, learner.optimizer), 1e3, first=0, steps=12)
+    assert float(optax.tree.get(again.optimizer, "best_value")) == np.min(info.objective)

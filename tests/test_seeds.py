@@ -2,6 +2,7 @@
 
 import json
 import signal
+import socket
 import subprocess
 import time
 from pathlib import Path
@@ -70,6 +71,57 @@ def test_killed_and_resumed_is_bit_equal(study: Path, tmp_path: Path) -> None:
     for seed in ("seed1", "seed2"):
         assert fingerprint(folder / seed) == fingerprint(study / seed)
         assert [row["trial"] for row in record.trials(folder / seed)] == [1, 2]
+
+
+def alike(study: Path, other: Path) -> None:
+    """Two folders of seeds hold the same runs, up to the order of sums."""
+    for seed in ("seed1", "seed2"):
+        for a, b in zip(record.trials(study / seed), record.trials(other / seed), strict=True):
+            for name in ("mean_cost", "objective_first", "objective_last", "objective_fresh"):
+                assert a[name] == pytest.approx(b[name], abs=2e-3), (seed, name)
+
+
+def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_path: Path) -> None:
+    """Four devices made of this processor, two for the seeds and two for the particles; resumed on one device."""
+    folder, words = tmp_path / "mesh", [*WORDS, "trials=1", "seeds=2", "mesh=2x2"]
+    done = call("train", *words, f"out={folder}", cwd=tmp_path, XLA_FLAGS="--xla_force_host_platform_device_count=4")
+    assert done.returncode == 0, done.stderr
+    assert call("train", f"resume={folder}", "trials=2", cwd=tmp_path).returncode == 0
+    alike(study, folder)
+
+
+def test_processes_that_act_as_one_machine_change_nothing(study: Path, tmp_path: Path) -> None:
+    with socket.socket() as free:
+        free.bind(("localhost", 0))
+        port = free.getsockname()[1]
+    words = [*WORDS, "seeds=2", f"out={tmp_path / 'shared'}", f"coordinator=localhost:{port}", "processes=2"]
+    command = [*program("train"), *words]
+    both = [
+        subprocess.Popen([*command, f"process={i}"], cwd=tmp_path, stderr=subprocess.PIPE, text=True) for i in range(2)
+    ]
+    errors = [process.communicate(timeout=300)[1] for process in both]
+    assert [process.returncode for process in both] == [0, 0], errors
+    assert "trial  2/2" in errors[0]
+    assert "trial" not in errors[1]  # one speaks
+    alike(study, tmp_path / "shared")
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [
+        ("mesh=2x1", "needs 2 devices"),
+        ("mesh=3x1", "mesh=1x1"),
+        ("mesh=two", "mesh=4x1"),
+        ("processes=2", "coordinator=HOST:PORT"),
+        ("distributed=maybe", "neither true nor false"),
+        ("distributed=true", "coordinator=HOST:PORT"),  # no SLURM and no MPI here
+    ],
+)
+def test_devices_that_are_not_there_are_one_clear_line(word: str, message: str, tmp_path: Path) -> None:
+    done = call("train", *WORDS, "seeds=2", word, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert message in done.stderr
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_of_seeds_is_drawn_and_kept(study: Path) -> None:

@@ -17,6 +17,8 @@ from pegasus_jax.config import (
     MLP,
     MODELS,
     POLICIES,
+    RBF,
+    Analytic,
     Config,
     Explore,
     Fit,
@@ -118,9 +120,9 @@ VARIANTS = [
 
 @pytest.mark.parametrize(("word", "variant"), VARIANTS)
 def test_a_variant_is_what_it_changes(word, variant):
-    sections = {name: value for name, value in variant.items() if "." not in name}
-    expected = dataclasses.replace(Config(), **sections)
-    assert parse(word) == settings.override(expected, {k: v for k, v in variant.items() if k not in sections})
+    sections = {name: change for name, change in variant.items() if "." not in name}
+    settled = {name: change for name, change in variant.items() if "." in name}
+    assert parse(word) == settings.override(dataclasses.replace(Config(), **sections), settled)
 
 
 def test_the_task_changes_only_what_the_chosen_variant_has():
@@ -159,13 +161,24 @@ def test_a_variant_brings_defaults_that_single_settings_change():
 
 
 def test_the_paper_is_a_variant():
-    """Alg. 3 and reference settings 1.2, 4.7, 5.2, 5.5: all draws but the start held for the whole search."""
+    """Alg. 3 and docs/reference.md 1.2, 4.7, 5.2, 5.5: all draws but the start held for the whole search."""
     chosen = parse("algorithm=paper")
     assert chosen.search.period == Period(start=1, dynamics=0, policy=0, sensor=0, match=0)
     assert (chosen.model.activation, chosen.model.kl_weight, chosen.fit.learning_rate) == ("relu", 1.0, 1e-4)
     assert (chosen.search.clip, chosen.search.particles) == (1, 100)
     assert not chosen.search.reset
     assert not chosen.search.restart
+
+
+def test_pilco_brings_its_own_search_and_precision():
+    """Whatever the task says of another algorithm's search, and in any order on the line."""
+    for words in (("algorithm=pilco", "task=swimmer_belly_up"), ("task=swimmer_belly_up", "algorithm=pilco")):
+        chosen = parse(*words)
+        assert isinstance(chosen.search, Analytic)
+        assert chosen.search.steps == Analytic.steps
+        assert chosen.precision == "double"
+    assert parse("policy=rbf").policy == RBF(units=30, squash="sine")
+    assert parse("policy=rbf100").policy == RBF(units=100)
 
 
 def test_options_are_kept_from_the_settings():
@@ -185,7 +198,7 @@ WRONG = [
     (["task=cartpol"], ["task=cartpol is unknown", "did you mean 'cartpole'?"]),
     (["model=lognormal"], ["model=lognormal is unknown", "did you mean 'log_normal'?"]),
     (["policy=drop_mlp"], ["did you mean 'dropout_mlp'?", "choices: dropout_mlp, mlp"]),
-    (["algorithm=pilco"], ["algorithm=pilco is unknown", "did you mean 'deep_pilco'?"]),
+    (["algorithm=pilko"], ["algorithm=pilko is unknown", "did you mean 'pilco'?"]),
     (["task="], ["task= is unknown", "cartpole"]),
     # unknown keys
     (["polcy=mlp"], ["polcy is not a setting", "did you mean 'policy'?"]),
@@ -231,6 +244,13 @@ WRONG = [
     (["search.clip=.inf"], ["search.clip=inf is out of range"]),
     (["search.period.match=-1"], ["search.period.match=-1", "the nearest is 0"]),
     (["search.discount=0"], ["search.discount=0", "(0, 1]"]),
+    (["search.risk=0"], ["search.risk=0 is out of range", "(0, 1]"]),
+    (["search.risk=.2", "search.cost=matched"], ["search.risk=0.2 needs", "search.cost=particles"]),
+    (["search.cost=mached"], ["search.cost=mached is not a choice", "did you mean 'matched'?"]),
+    (["search.truncate=0"], ["search.truncate=0 is out of range", "the nearest is 1"]),
+    (["policy=rbf", "policy.units=0"], ["policy.units=0 is out of range", "the nearest is 1"]),
+    (["policy=linear", "policy.units=9"], ["policy.units is not a setting"]),
+    (["algorithm=pilco", "search.clip=1"], ["search.clip is not a setting"]),
     (["model.dropout=lognormal"], ["model.dropout=lognormal is not a choice", "did you mean 'log_normal'?"]),
     (["policy.squash=tan"], ["did you mean 'tanh'?", "choices: tanh, sine"]),
     (["model.low=1"], ["model.low=1 must be less than model.high=0"]),
@@ -282,6 +302,7 @@ TOGETHER = [
     ["model=concrete", "model.rate=0"],
     ["search.particles=2"],
     ["search.particles=2", "search.match=false", "search.balanced=true"],
+    ["policy=rbf", "algorithm=pilco"],
 ]
 
 

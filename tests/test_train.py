@@ -23,8 +23,9 @@ def program(name: str) -> list[str]:
     return [sys.executable, "-c", f"from pegasus_jax.cli import {name}; {name}()"]
 
 
-def call(name: str, *words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([*program(name), *map(str, words)], cwd=cwd, capture_output=True, text=True, check=False)
+def call(name: str, *words: object, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
+    command = [*program(name), *map(str, words)]
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, env={**os.environ, **env})
 
 
 def fingerprint(run: Path) -> str:

@@ -27,7 +27,9 @@ def passive_force(physics: Any, data: Any) -> Array:
         )
     if host.opt.density > 0.0 or host.opt.viscosity > 0.0:
         moved = jnp.asarray(_moved(host.body_parentid.tobytes(), host.dof_bodyid.tobytes()), force.dtype)
-        force = force + jnp.sum(data.cdof * (moved @ _drag(model, data)), axis=1)
+        power = data.cdof * (moved @ _drag(model, data))
+        # Six additions along the batch: a sum over an axis of six is several times slower.
+        force = force + sum(power[:, i] for i in range(6))
     return force
 
 

@@ -18,7 +18,7 @@ class Guest(NamedTuple):
     reset: Callable[[Array], Array]
     """key -> x [D]"""
     step: Callable[[Array, Array], Array]
-    """(x [D] of the step before, control [U]) -> x [D]; the environment knows its state itself"""
+    """(x [D] of the step before, control [U]) -> x [D]; the environment knows its state itself, and rests when ended"""
     observe: Callable[[Array], Array]
     control_low: np.ndarray
     control_high: np.ndarray
@@ -31,7 +31,7 @@ class Guest(NamedTuple):
 
 
 def guest(name: str) -> Guest:
-    """The environment that Gymnasium knows as `name`. Episodes have one length: an early end is not heeded.
+    """The environment that Gymnasium knows as `name`. Episodes have one length: after an early end, x stays as it is.
 
     Raises ValueError, in one line, when there is none, or its controls or observations are not vectors of numbers.
     """
@@ -49,11 +49,19 @@ def guest(name: str) -> Guest:
     shape = jax.ShapeDtypeStruct(seen.shape, np.float32)
     starts = np.stack([env.reset(seed=seed)[0] for seed in range(RESETS)])
 
+    ended = False
+
     def host_reset(seed: Any) -> np.ndarray:
+        nonlocal ended
+        ended = False
         return np.asarray(env.reset(seed=int(seed))[0], np.float32)
 
-    def host_step(_: Any, control: Any) -> np.ndarray:
-        return np.asarray(env.step(np.asarray(control, controls.dtype))[0], np.float32)
+    def host_step(x: Any, control: Any) -> np.ndarray:
+        nonlocal ended
+        if ended:  # what a step would do is undefined
+            return np.asarray(x)
+        seen, _, ended, *_ = env.step(np.asarray(control, controls.dtype))
+        return np.asarray(seen, np.float32)
 
     # Each call takes the result of the one before, which keeps them in order.
     fps = env.metadata.get("render_fps", 1)

@@ -28,6 +28,7 @@ with redirect_stdout(io.StringIO()):  # on import MJX prints that warp, which we
     from mujoco import mjx
 
 from pegasus_envs.fluid import passive_force
+from pegasus_envs.inertia import solve
 
 ASSETS = Path(__file__).parent / "assets"
 
@@ -74,8 +75,10 @@ def _compiled(name: str) -> mujoco.MjModel:
 @cache
 def _on_device(name: str, x64: bool) -> tuple[Any, Any]:
     del x64  # part of the cache's key only: the arrays have that precision
+    here = jax.local_devices()[0]  # MJX would choose the first of all, which may be another process's
     with jax.ensure_compile_time_eval():  # so that a plant may be built inside jit, and still be cached
-        return mjx.put_model(_compiled(name), impl="jax"), mjx.make_data(_compiled(name), impl="jax")
+        compiled = _compiled(name)
+        return mjx.put_model(compiled, here, impl="jax"), mjx.make_data(compiled, here, impl="jax")
 
 
 def load(name: str, changes: Iterable[Change] = ()) -> Physics:
@@ -136,7 +139,7 @@ def acceleration(physics: Physics, qpos: Array, qvel: Array, control: Array) -> 
     moment = data._impl.actuator_moment
     data = mjx.fwd_actuation(model, data.tree_replace({"_impl.actuator_velocity": moment @ qvel}))
     force = passive_force(physics, data) - data.qfrc_bias + data.qfrc_actuator
-    return jax.scipy.linalg.solve(mjx.full_m(model, data), force, assume_a="pos")
+    return solve(mjx.full_m(model, data), force, tuple(physics.host.dof_parentid.tolist()))
 
 
 def displace(physics: Physics, qpos: Array, velocity: Array, time: Array | float) -> Array:

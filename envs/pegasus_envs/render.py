@@ -7,13 +7,11 @@ import os
 import sys
 from collections.abc import Iterable
 from importlib import import_module
-from typing import Any
+from typing import Any, Protocol
 
 import jax
 import mujoco
 import numpy as np
-
-from pegasus_envs.plant import Plant
 
 _ADVICE = (
     "Cannot draw: no way of drawing without a display works here. Install EGL or OSMesa, for example "
@@ -54,10 +52,22 @@ def _forget(modules: set[str], platform: str | None) -> None:
         os.environ.pop("PYOPENGL_PLATFORM", None)
 
 
-class Renderer:
-    """Draws states of one plant; holds a graphics context, so close it (or use it in a `with`)."""
+class Drawn(Protocol):
+    """What drawing needs of a plant."""
 
-    def __init__(self, plant: Plant, width: int = 640, height: int = 480):
+    @property
+    def model(self) -> Any: ...
+    @property
+    def qpos(self) -> Any: ...
+
+
+class Renderer:
+    """Draws states of one plant, as its first camera sees them.
+
+    Holds a graphics context, so close it (or use it in a `with`).
+    """
+
+    def __init__(self, plant: Drawn, width: int = 640, height: int = 480):
         self._qpos, self._model, self._size = plant.qpos, plant.model, (width, height)
         self._data = mujoco.MjData(plant.model)
         self._context: Any = graphics_context(width, height)
@@ -65,8 +75,9 @@ class Renderer:
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._drawing)
         self._scene = mujoco.MjvScene(plant.model, maxgeom=1000)
         self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = plant.model.camera("side").id
+        mujoco.mjv_defaultFreeCamera(plant.model, self._camera)
+        if plant.model.ncam:
+            self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
 
     def __call__(self, state: Any) -> np.ndarray:
         """A picture [height, width, 3] of 8-bit colours."""
@@ -96,7 +107,7 @@ class Renderer:
         self.close()
 
 
-def frames(plant: Plant, states: Iterable[Any], width: int = 640, height: int = 480) -> list[np.ndarray]:
+def frames(plant: Drawn, states: Iterable[Any], width: int = 640, height: int = 480) -> list[np.ndarray]:
     """Pictures [height, width, 3] of a sequence of states."""
     with Renderer(plant, width, height) as draw:
         return [draw(state) for state in states]

@@ -7,19 +7,24 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 
-from pegasus_jax import angles, cost, dropout, episode, moments, scenarios, tasks, trial
+from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco, scenarios, tasks, trial
 from pegasus_jax import config as settings
+from pegasus_jax.cost import of_particles
 from pegasus_jax.dynamics.bnn import HEADS, bnn
 from pegasus_jax.dynamics.ensemble import ensemble
 from pegasus_jax.dynamics.gp import gp
 from pegasus_jax.dynamics.ssgp import ssgp
 from pegasus_jax.fit import minibatches
 from pegasus_jax.lbfgs import full_data
+from pegasus_jax.mesh import Spread, over_particles, together
+from pegasus_jax.policy.linear import linear
 from pegasus_jax.policy.mlp import mlp
+from pegasus_jax.policy.rbf import rbf
 from pegasus_jax.policy.squash import SQUASHES, to_limits
 from pegasus_jax.rollout import NoiseUse, rollout
-from pegasus_jax.search import objective, particles
+from pegasus_jax.search import keeping_best, objective, particles, remembering
 from pegasus_jax.types import (
     Array,
     Dropout,
@@ -40,18 +45,25 @@ EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 
 
 @lru_cache(maxsize=64)
-def build(config: settings.Config) -> Experiment:
+def build(config: settings.Config, mesh: Mesh | None = None) -> Experiment:
     """The experiment of a config. Cached: the same config gives the same functions, which compile once."""
-    return compose(config, tasks.of_config(config))
+    return compose(config, tasks.of_config(config), mesh=mesh)
 
 
 def compose(
-    config: settings.Config, task: Task, dynamics: Dynamics | None = None, policy: Policy | None = None
+    config: settings.Config,
+    task: Task,
+    dynamics: Dynamics | None = None,
+    policy: Policy | None = None,
+    mesh: Mesh | None = None,
 ) -> Experiment:
-    """The experiment of a config on any task; a model or policy of your own takes the configured one's place."""
+    """The experiment of a config on any task; a model or policy of your own takes the configured one's place.
+
+    With a `mesh` (mesh.py) the particles of a search are spread over its devices.
+    """
     dynamics = dynamics or dynamics_of(config.model, task)
     policy = policy or policy_of(config.policy, task)
-    searcher, imagine = search_of(config.search, task, dynamics, policy)
+    searcher, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)
     explore = config.explore
     return trial.experiment(
@@ -92,45 +104,133 @@ def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]  # (key, policy parameters, belief) -> cost [H, K] too
 
 
-def search_of(search: settings.Search, task: Task, dynamics: Dynamics, policy: Policy) -> tuple[Searcher, Imagine]:
+def search_of(
+    search: settings.Search | settings.Analytic,
+    task: Task,
+    dynamics: Dynamics,
+    policy: Policy,
+    spread: Spread = together,
+) -> tuple[Searcher, Imagine]:
     """The configured way of improving a policy, and fresh imagined rollouts of the same kind."""
+    aggregate = AGGREGATES[search.aggregate]
+    noise = NoiseUse(search.policy_noise, search.state_noise, search.cost_noise)
+    if isinstance(search, settings.Analytic):
+        return analytic_search_of(search, task, dynamics, policy, discounted(search, aggregate), noise)
     if (search.match or search.balanced) and search.particles <= len(task.state_names):
         states, what = len(task.state_names), "moment matching" if search.match else "balanced draws"
         raise settings.SettingError(
             f"search.particles={search.particles} is too few: {what} of {states} dimensions needs at least {states + 1}"
         )
-    blocks = scenarios.blocks(
-        dynamics=dynamics,
-        policy=policy,
-        start=partial(start, task=task),
-        particles=search.particles,
-        horizon=task.horizon,
-        balanced=search.balanced,
-    )
+    if search.risk < 1:
+        aggregate = cost.worst(search.risk, aggregate)
+    blocks = blocks_of(search.particles, task, dynamics, policy, balanced=search.balanced, spread=spread)
     pieces: dict[str, Any] = dict(
-        dynamics=dynamics,
-        policy=policy,
-        match=moments.match if search.match else moments.keep,
-        noise=NoiseUse(search.policy_noise, search.state_noise, search.cost_noise),
+        dynamics=dynamics, policy=policy, match=moments.match if search.match else moments.keep, noise=noise
     )
     period, costs = Period(**vars(search.period)), cost.of_particles(task.cost)
-    aggregate = AGGREGATES[search.aggregate]
-    if search.discount < 1:
-        aggregate = cost.discounted(search.discount, aggregate)
+    if search.cost == "matched":
+        costs = cost.of_matched(expected_cost_of(task, "search.cost=matched"))
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
+    optimizer = optax.chain(clip, optax.adam(search.learning_rate))
     searcher = particles(
-        partial(objective, **pieces, cost=costs, aggregate=aggregate),
-        optax.chain(clip, optax.adam(search.learning_rate)),
+        partial(objective, **pieces, cost=costs, aggregate=discounted(search, aggregate), truncate=search.truncate),
+        remembering(optimizer) if search.best else optimizer,
         blocks=blocks,
         period=period,
     )
+    imagine = partial(imagined, **pieces, blocks=blocks, cost=task.cost)
+    return keeping_best(searcher, search.steps) if search.best else searcher, imagine
 
-    def imagine(key: Key, params: Params, belief: Params) -> tuple[Rollout, Array]:
-        fresh = scenarios.draw(key, 0, belief, blocks=blocks, period=period)
-        imagined = rollout(params, belief, fresh, **pieces)
-        return imagined, costs(imagined.seen)
 
-    return searcher, imagine
+def analytic_search_of(
+    search: settings.Analytic,
+    task: Task,
+    dynamics: Dynamics,
+    policy: Policy,
+    aggregate: cost.Aggregate,
+    noise: NoiseUse,
+) -> tuple[Searcher, Imagine]:
+    """PILCO's search. Raises SettingError where a piece has no moments."""
+    if dynamics.moments is None:
+        raise settings.SettingError("algorithm=pilco needs a model with analytic moments: model=ssgp, model=gp")
+    if policy.moments is None:
+        raise settings.SettingError(
+            "algorithm=pilco needs a policy with analytic moments, saturated by sines: policy=rbf, policy=linear"
+        )
+    mean, std = jnp.asarray(task.start_mean, float), jnp.asarray(task.start_std, float)
+    low, high = limits(task)
+    pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy)
+
+    def noise_std(key: Key, belief: Params) -> Array:
+        middle = (low + high) / 2
+        return dynamics.apply(belief, dynamics.sample(key, belief), mean, middle).std
+
+    def value(params: Params, belief: Params, std: Array) -> Array:
+        return pilco.objective(
+            params,
+            belief,
+            begin,
+            std,
+            **pieces,
+            horizon=task.horizon,
+            angles=task.angles,
+            expected_cost=expected,
+            aggregate=aggregate,
+            noise=noise,
+        )
+
+    begin, expected = (mean, jnp.diag(std**2)), expected_cost_of(task, "algorithm=pilco")
+    blocks = blocks_of(search.particles, task, dynamics, policy)
+    imagine = partial(imagined, **pieces, blocks=blocks, cost=task.cost, match=moments.keep, noise=noise)
+    return pilco.analytic(value, noise_std), imagine
+
+
+def expected_cost_of(task: Task, setting: str) -> cost.Expected:
+    """The task's expected cost of a Gaussian state. Raises SettingError, naming the setting, where it is not known."""
+    if task.expected_cost is None:
+        raise settings.SettingError(
+            f"{setting} needs a cost whose expectation is known in closed form, and that of task={task.name} is not"
+        )
+    return task.expected_cost
+
+
+def discounted(search: settings.Search | settings.Analytic, aggregate: cost.Aggregate) -> cost.Aggregate:
+    """The aggregate, discounted where the search says so."""
+    return cost.discounted(search.discount, aggregate) if search.discount < 1 else aggregate
+
+
+def blocks_of(
+    particles: int,
+    task: Task,
+    dynamics: Dynamics,
+    policy: Policy,
+    balanced: bool = False,
+    spread: Spread = together,
+) -> scenarios.Blocks:
+    """How the scenarios of a task's imagined rollouts are drawn."""
+    return scenarios.blocks(
+        dynamics=dynamics,
+        policy=policy,
+        start=partial(start, task=task),
+        particles=particles,
+        horizon=task.horizon,
+        balanced=balanced,
+        spread=spread,
+    )
+
+
+def imagined(
+    key: Key,
+    params: Params,
+    belief: Params,
+    *,
+    blocks: scenarios.Blocks,
+    cost: Callable[[Array], Array],
+    **pieces: Any,
+) -> tuple[Rollout, Array]:
+    """Rollouts under fresh scenarios and the cost of every particle [H, K]."""
+    rolled = rollout(params, belief, scenarios.draw(key, 0, belief, blocks=blocks, period=Period()), **pieces)
+    return rolled, of_particles(cost)(rolled.seen)
 
 
 def start(key: Key, *, task: Task) -> Array:
@@ -194,15 +294,41 @@ def _dropout_of(config: settings.BNN) -> Dropout:
             return dropout.none()
 
 
-def policy_of(config: settings.MLP, task: Task) -> Policy:
+def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task) -> Policy:
     """The configured controller of a task."""
-    return mlp(
-        encode=partial(angles.encode, angles=task.angles),
-        features=len(task.state_names) + len(task.angles),
-        controls=len(task.control_names),
-        hidden=config.hidden,
-        dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
-        saturate=to_limits(SQUASHES[config.squash], *limits(task)),
-        initialiser=config.initialiser,
-        output_scale=config.output_scale,
-    )
+    low, high = limits(task)
+    encode = partial(angles.encode, angles=task.angles)
+    features, controls = len(task.state_names) + len(task.angles), len(task.control_names)
+    saturate = to_limits(SQUASHES[config.squash], low, high)
+    # Of the saturations, only the sine has moments in closed form.
+    saturate_moments = partial(gaussian.squash, low=low, high=high) if config.squash == "sine" else None
+    match config:
+        case settings.RBF():
+            return rbf(
+                encode=encode,
+                start=partial(start, task=task),
+                waves=2 * len(task.angles),
+                controls=controls,
+                units=config.units,
+                saturate=saturate,
+                saturate_moments=saturate_moments,
+            )
+        case settings.Linear():
+            return linear(
+                encode=encode,
+                features=features,
+                controls=controls,
+                saturate=saturate,
+                saturate_moments=saturate_moments,
+            )
+        case settings.MLP():
+            return mlp(
+                encode=encode,
+                features=features,
+                controls=controls,
+                hidden=config.hidden,
+                dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
+                saturate=saturate,
+                initialiser=config.initialiser,
+                output_scale=config.output_scale,
+            )

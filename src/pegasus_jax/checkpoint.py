@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
@@ -19,8 +20,8 @@ def save(run: Path, trial: int, state: RunState) -> None:
     path = _folder(run, trial)
     _sums(run, trial).unlink(missing_ok=True)
     shutil.rmtree(path, ignore_errors=True)
-    with ocp.StandardCheckpointer() as checkpointer:
-        checkpointer.save(path, _plain(state))
+    with _checkpointer() as checkpointer:
+        checkpointer.save(path, jax.tree.map(np.asarray, _plain(state)))  # of the host: any devices can read it back
     write_json(_sums(run, trial), {str(f.relative_to(path)): _digest(f) for f in _files(path)})
 
 
@@ -47,9 +48,9 @@ def damage(run: Path, trial: int) -> str | None:
 
 def restore(run: Path, trial: int, like: RunState) -> RunState:
     """The state after a trial; `like` is a state of the same experiment (shapes are enough: eval_shape of init)."""
-    target = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), jax.eval_shape(_plain, like))
-    with ocp.StandardCheckpointer() as checkpointer:
-        state = checkpointer.restore(_folder(run, trial), target)
+    target = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(_plain, like))
+    with _checkpointer() as checkpointer:
+        state = jax.tree.map(jnp.asarray, checkpointer.restore(_folder(run, trial), target))
     return state._replace(key=jax.random.wrap_key_data(state.key))
 
 
@@ -61,6 +62,15 @@ def fingerprint(state: RunState) -> str:
         digest.update(jax.tree_util.keystr(path).encode())
         digest.update(np.ascontiguousarray(leaf).tobytes())
     return digest.hexdigest()
+
+
+def _checkpointer() -> ocp.StandardCheckpointer:
+    """One that waits for no other process: each reads for itself, and one alone writes."""
+    own = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(
+        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
+    )
+    return ocp.StandardCheckpointer(multiprocessing_options=alone)
 
 
 def _plain(state: RunState) -> RunState:

@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 from pegasus_jax.config import Config, SettingError
 
@@ -20,6 +21,10 @@ pegasus-train resume=RUN [trials=N]             go on with a run, also one that 
   out=runs/...          the run's folder (default: runs/TASK-seedN)
   seeds=1               so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN
 
+  mesh=SEEDSxPARTICLES  the devices that share seeds and particles (default: as many as share the seeds evenly)
+  distributed=true      started on several hosts at once by SLURM or MPI: their devices act as one machine; without
+                        those, coordinator=HOST:PORT processes=N process=I on each. They share OUT on one file system
+
 A named variant brings its defaults; the settings below change them one by one.
 {settings}
 {others}
@@ -30,6 +35,7 @@ examples
   pegasus-train task=cartpole algorithm=deep_pilco search.clip=1
   pegasus-train task=swimmer_corkscrew legs=6
   pegasus-train task=gym env=Pendulum-v1 cost=mymodule:cost horizon=40
+  pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
   pegasus-train resume=runs/demo trials=20
 
 Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, pegasus-play RUN, or
@@ -87,13 +93,16 @@ def play() -> None:
     _main(_play, PLAY)
 
 
+OPTIONS = ("out", "resume", "seeds", "mesh", "distributed", "coordinator", "processes", "process")  # of pegasus-train
+
+
 def _train(words: Sequence[str]) -> None:
     from pegasus_jax import record, settings, tasks
 
-    options, rest = settings.split(words, ("out", "resume", "seeds"))
+    options, rest = settings.split(words, OPTIONS)
     command = shlex.join(["pegasus-train", *words])
     if "resume" in options:
-        if wrong := sorted(({*rest} | {*options}) - {"resume", "trials"}):
+        if wrong := sorted({*rest, *options} - {"resume", "trials", *OPTIONS[3:]}):
             raise SettingError(f"{wrong[0]} cannot be changed by resume=; only trials= can")
         home = Path(options["resume"])
         runs = record.seeds_of(home)
@@ -101,26 +110,74 @@ def _train(words: Sequence[str]) -> None:
         config = settings.override(settings.load(first / "config.yaml"), settings.values(rest))
         runs = runs or {config.seed: home}
     else:
-        config = settings.parse(rest, options=("out", "resume", "seeds"))
+        config = tasks.pinned(settings.parse(rest, options=OPTIONS))
         seeds = range(config.seed, config.seed + _whole("seeds", options.get("seeds", "1")))
-        label = f"seed{seeds[0]}" if len(seeds) == 1 else f"seeds{seeds[0]}-{seeds[-1]}"
-        home = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{config.task}-{label}"))
+        name = f"seed{seeds[0]}" if len(seeds) == 1 else f"seeds{seeds[0]}-{seeds[-1]}"
+        home = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{tasks.label(config)}-{name}"))
         runs = {config.seed: home} if len(seeds) == 1 else {seed: home / f"seed{seed}" for seed in seeds}
     if len(runs) > 1 and config.task == tasks.GYM:
         raise SettingError(f"seeds={len(runs)} is too many for task=gym, whose environment is one object; seeds=1")
+    _join(options)
+    over = _mesh(options.get("mesh"), len(runs))
     from pegasus_jax.build import build, set_precision
+    from pegasus_jax.program import leads
 
     set_precision(config)
     build(config)  # so that impossible settings end here, before anything is written
-    if "resume" not in options:
+    if "resume" not in options and leads():
         if record.seeds_of(home):
             raise SettingError(f"out={home} holds runs already; resume={home} goes on, out={record.free(home)} is free")
         for run in runs.values():
             record.create(run)
     from pegasus_jax.train import train_seeds
 
-    train_seeds(config, runs, resume="resume" in options, command=command)
-    print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
+    train_seeds(config, runs, resume="resume" in options, command=command, mesh=over)
+    if leads():
+        print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
+
+
+def _join(options: dict[str, str]) -> None:
+    """Join the other processes of a study, if there are any, through jax.distributed."""
+    import jax
+
+    given = {name for name in ("coordinator", "processes", "process") if name in options}
+    if not given and options.get("distributed", "false") == "false":
+        return
+    if given and len(given) < 3:
+        raise SettingError("coordinator=HOST:PORT, processes=N and process=I (from 0) go together")
+    if options.get("distributed", "true") != "true":
+        raise SettingError(f"distributed={options['distributed']} is neither true nor false")
+    try:
+        if given:
+            count, index = (_whole(name, options[name]) for name in ("processes", "process"))
+            jax.distributed.initialize(options["coordinator"], count, index)
+        else:
+            jax.distributed.initialize()  # SLURM, Open MPI and others say where the coordinator is
+    except (RuntimeError, ValueError) as error:
+        raise SettingError(f"distributed=true: {str(error).splitlines()[0]}; or give coordinator=HOST:PORT") from error
+
+
+def _mesh(text: str | None, seeds: int) -> Any:
+    """The mesh that mesh=SEEDSxPARTICLES asks for; by default as many devices as share the seeds evenly."""
+    import math
+
+    import jax
+
+    from pegasus_jax.mesh import mesh
+
+    if text is None:
+        return mesh(math.gcd(seeds, jax.device_count()), 1)
+    first, cross, second = text.partition("x")
+    if not (cross and first.isdecimal() and second.isdecimal() and int(first) and int(second)):
+        raise SettingError(f"mesh={text} is not of the form SEEDSxPARTICLES; for example mesh=4x1")
+    if seeds % int(first):
+        raise SettingError(
+            f"mesh={text} cannot share {seeds} seeds evenly; mesh={math.gcd(seeds, int(first))}x{second}"
+        )
+    try:
+        return mesh(int(first), int(second))
+    except ValueError as error:
+        raise SettingError(f"mesh={text} {error}") from error
 
 
 def _evaluate(words: Sequence[str]) -> None:

@@ -71,6 +71,7 @@ INITIALISERS = ("glorot", "orthogonal")
 SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
 AGGREGATES = ("mean", "total")
+COSTS = ("particles", "matched")
 EXECUTIONS = ("sampled", "mean")
 LEGS = (2, 6)
 PRECISIONS = ("single", "double")
@@ -163,6 +164,34 @@ class MLP:
 
 
 @dataclass(frozen=True)
+class RBF:
+    """A controller of radial basis functions: the mean of a Gaussian process, PILCO's."""
+
+    kind: str = setting("rbf", "")
+    units: int = setting(30, "radial basis functions")
+    squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
+    execution = "mean"  # no setting: there is nothing to sample
+
+    def __post_init__(self) -> None:
+        _kind("policy", self.kind, "rbf")
+        _within("policy.units", self.units, 1)
+        _choice("policy.squash", self.squash, SQUASHES)
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A linear controller of the encoded state."""
+
+    kind: str = setting("linear", "")
+    squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
+    execution = "mean"  # no setting: there is nothing to sample
+
+    def __post_init__(self) -> None:
+        _kind("policy", self.kind, "linear")
+        _choice("policy.squash", self.squash, SQUASHES)
+
+
+@dataclass(frozen=True)
 class Fit:
     """Model learning after each trial, by Adam on minibatches."""
 
@@ -221,6 +250,10 @@ class Search:
     balanced: bool = setting(False, "make the drawn noise exactly zero mean, unit covariance over the particles")
     aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
     discount: float = setting(1.0, "weight of a later step against the one before")
+    cost: str = setting("particles", "of each of the particles, or the expected one of the matched Gaussian: matched")
+    risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
+    truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
+    best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
     policy_noise: float = setting(1.0, "factor of the predicted noise on what the policy sees")
@@ -235,6 +268,37 @@ class Search:
         _within("search.learning_rate", self.learning_rate, 0, open_low=True)
         if self.clip is not None:
             _within("search.clip", self.clip, 0, open_low=True)
+        _choice("search.aggregate", self.aggregate, AGGREGATES)
+        _within("search.discount", self.discount, 0, 1, open_low=True)
+        _choice("search.cost", self.cost, COSTS)
+        _within("search.risk", self.risk, 0, 1, open_low=True)
+        if self.risk < 1 and self.cost == "matched":
+            raise SettingError(f"search.risk={self.risk:g} needs the cost of each particle: search.cost=particles")
+        if self.truncate is not None:
+            _within("search.truncate", self.truncate, 1)
+        for name in ("policy_noise", "state_noise", "cost_noise"):
+            _within(f"search.{name}", getattr(self, name), 0)
+
+
+@dataclass(frozen=True)
+class Analytic:
+    """Policy search after each fit, PILCO's: L-BFGS on the expected cost of a Gaussian, propagated analytically."""
+
+    kind: str = setting("analytic", "")
+    steps: int = setting(300, "iterations of L-BFGS a trial, at most")
+    particles: int = setting(100, "K, rollouts imagined afterwards for the record; the search has none")
+    aggregate: str = setting("mean", "over the horizon: mean, or total, PILCO's sum")
+    discount: float = setting(1.0, "weight of a later step against the one before")
+    restart: bool = setting(True, "start a search from a fresh policy when it expects a lower cost than the old one")
+    policy_noise: float = setting(0.0, "factor of the model's noise on what the policy sees")
+    state_noise: float = setting(0.0, "factor of the model's noise added to the state")
+    cost_noise: float = setting(0.0, "factor of the model's noise on what the cost sees")
+    reset = True  # no setting: curvature is that of one model
+
+    def __post_init__(self) -> None:
+        _kind("search", self.kind, "analytic")
+        _within("search.steps", self.steps, 1)
+        _within("search.particles", self.particles, 2)
         _choice("search.aggregate", self.aggregate, AGGREGATES)
         _within("search.discount", self.discount, 0, 1, open_low=True)
         for name in ("policy_noise", "state_noise", "cost_noise"):
@@ -260,22 +324,35 @@ class Config:
     task: str = setting("cartpole", "what to learn")
     legs: int = setting(2, "that a swimmer drives: 2 or 6; the other tasks have none")
     env: str | None = setting(None, "of task=gym: the environment's Gymnasium id")
-    cost: str | None = setting(None, "of task=gym: module:function, observation [D] -> cost in [0, 1], in JAX")
-    angles: tuple[int, ...] = setting((), "of task=gym: the entries of the observation that are angles [rad]")
-    horizon: int | None = setting(None, "of task=gym: control periods an episode; null: the environment's own limit")
+    mjcf: str | None = setting(None, "of task=mjcf: the MuJoCo file, path/to/model.xml")
+    mjcf_digest: str | None = setting(None, "SHA-256 of the compiled mjcf= file; a run notes it, and refuses another")
+    cost: str | None = setting(None, "of task=gym|mjcf: module:function, observation [D] -> cost in [0, 1], in JAX")
+    angles: tuple[int, ...] = setting((), "of task=gym|mjcf: the entries of the observation that are angles [rad]")
+    horizon: int | None = setting(None, "of task=gym|mjcf: control periods an episode; null: a gym's own limit")
+    dt: float | None = setting(None, "of task=mjcf: control period [s], a whole number of the file's time steps")
+    observe: tuple[str, ...] = setting((), "of task=mjcf: as [qpos.0,qvel.1]; []: all positions, then all velocities")
+    control_low: tuple[float, ...] = setting((), "of task=mjcf: least controls; []: the file's ctrlrange")
+    control_high: tuple[float, ...] = setting((), "of task=mjcf: greatest controls; []: the file's ctrlrange")
+    start_mean: tuple[float, ...] = setting((), "of task=mjcf: of the observation; []: the file's pose, at rest")
+    start_std: tuple[float, ...] = setting((0.1,), "of task=mjcf: spread of the starts, one for all or one each")
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
     precision: str = setting("single", "of all numbers: single (32 bits) or double (64)")
     model: BNN | GP | SSGP = BNN()
-    policy: MLP = MLP()
+    policy: MLP | RBF | Linear = MLP()
     fit: Fit | LBFGS = Fit()
-    search: Search = Search()
+    search: Search | Analytic = Search()
     explore: Explore = Explore()
 
     def __post_init__(self) -> None:
         _choice("legs", self.legs, LEGS)
         _choice("precision", self.precision, PRECISIONS)
-        object.__setattr__(self, "angles", tuple(self.angles))
+        for name in ("angles", "observe", "control_low", "control_high", "start_mean", "start_std"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for deviation in self.start_std:
+            _within("start_std", deviation, 0)
+        if self.dt is not None:
+            _within("dt", self.dt, 0, open_low=True)
         if self.horizon is not None:
             _within("horizon", self.horizon, 1)
         _within("seed", self.seed, 0, 2**32 - 1)
@@ -299,6 +376,9 @@ MODELS: dict[str, dict[str, Any]] = {
 POLICIES: dict[str, dict[str, Any]] = {
     "dropout_mlp": {},
     "mlp": {"policy": MLP(dropout=0.0)},
+    "rbf": {"policy": RBF()},
+    "rbf100": {"policy": RBF(units=100)},
+    "linear": {"policy": Linear()},
 }
 ALGORITHMS: dict[str, dict[str, Any]] = {
     "pegasus": {},  # the defaults: what learned best (docs/decisions/0001)
@@ -327,12 +407,13 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
         "search.period.sensor": 1,
         "search.period.match": 1,
     },
+    "pilco": {"search": Analytic(), "search.steps": Analytic.steps, "precision": "double"},
 }
 
 # What each section can be, by the kind that a stored config names.
 KINDS: dict[str, dict[str, Any]] = {
     "model": {"bnn": BNN(), "gp": GP(), "ssgp": SSGP()},
-    "policy": {"mlp": MLP()},
+    "policy": {"mlp": MLP(), "rbf": RBF(), "linear": Linear()},
     "fit": {"adam": Fit(), "lbfgs": LBFGS()},
-    "search": {"particles": Search()},
+    "search": {"particles": Search(), "analytic": Analytic()},
 }

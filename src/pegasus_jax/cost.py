@@ -4,15 +4,20 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from pegasus_jax.gaussian import saturating_cost, sincos
+from pegasus_jax.moments import mean_and_cov
 from pegasus_jax.types import Array
 
 Cost = Callable[[Array], Array]  # x [D] -> scalar
+Error = Callable[[Array], Array]  # x [D] -> e [E], affine in the features of x
+Expected = Callable[[Array, Array], Array]  # (mean [D], cov [D, D]) of a Gaussian state -> scalar
 Aggregate = Callable[[Array], Array]  # costs [H, K] -> scalar
 
 
-def saturating(error: Callable[[Array], Array], width: float) -> Cost:
-    """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; reference settings 1.3)."""
+def saturating(error: Error, width: float) -> Cost:
+    """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; docs/reference.md 1.3)."""
 
     def cost(x: Array) -> Array:
         e = error(x) / width
@@ -21,9 +26,45 @@ def saturating(error: Callable[[Array], Array], width: float) -> Cost:
     return cost
 
 
+def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Array, Array]:
+    """(matrix [E, F], offset [E]) with error(x) = matrix @ encode(x, angles) + offset.
+
+    Exact for an error that is affine in the plain entries of x [D] and in the sines and cosines of its angles [rad].
+    """
+    plain = np.array([i for i in range(states) if i not in angles], int)
+    angle = np.array(angles, int)
+    unit = np.eye(states)
+    at = jax.vmap(error)
+    origin = error(jnp.zeros(states))
+    linear = at(jnp.asarray(unit[plain])) - origin
+    up, down = at(jnp.asarray(unit[angle] * np.pi / 2)), at(jnp.asarray(-unit[angle] * np.pi / 2))
+    cosine = (origin - at(jnp.asarray(unit[angle] * np.pi))) / 2
+    return jnp.concatenate([linear, (up - down) / 2, cosine]).T, origin - jnp.sum(cosine, 0)
+
+
+def expected_saturating(error: Error, width: float, angles: tuple[int, ...]) -> Expected:
+    """The expectation of `saturating(error, width)` of a Gaussian state, as PILCO has it (docs/reference.md 1.3).
+
+    The features of the state are taken for Gaussian, with their exact moments: exact without angles, and as close as
+    that is with them.
+    """
+
+    def expected(mean: Array, cov: Array) -> Array:
+        features = sincos(mean, cov, angles)
+        matrix, offset = (a.astype(mean.dtype) for a in affine_error(error, mean.shape[0], angles))
+        return saturating_cost(features.mean, features.cov, matrix, offset, width)
+
+    return expected
+
+
 def of_particles(cost: Cost) -> Callable[[Array], Array]:
     """The cost of every particle: x [H, K, D] -> [H, K]."""
     return jax.vmap(jax.vmap(cost))
+
+
+def of_matched(expected: Expected) -> Callable[[Array], Array]:
+    """The expected cost of the Gaussian with the particles' mean and covariance: x [H, K, D] -> [H, 1]."""
+    return jax.vmap(lambda x: expected(*mean_and_cov(x))[None])
 
 
 def mean(costs: Array) -> Array:
@@ -32,7 +73,7 @@ def mean(costs: Array) -> Array:
 
 
 def total(costs: Array) -> Array:
-    """Cost of an episode, averaged over particles: the paper's eq. 1 and Alg. 3 line 16."""
+    """Cost of an episode, averaged over particles: the paper's eq. 1 and Alg. 3 line 15."""
     return jnp.sum(jnp.mean(costs, 1))
 
 
@@ -43,3 +84,20 @@ def discounted(discount: float, aggregate: Aggregate = mean) -> Aggregate:
         return aggregate(costs * discount ** jnp.arange(costs.shape[0], dtype=costs.dtype)[:, None])
 
     return weighted
+
+
+def worst(fraction: float, aggregate: Aggregate = mean) -> Aggregate:
+    """The aggregate of the costliest `fraction` of the K particles, by mean cost a step: CVaR at level 1 - fraction.
+
+    Where fraction * K is not whole, the last particle counts in part (Rockafellar & Uryasev 2002). A `discounted`
+    around it ranks by discounted cost.
+    """
+
+    def tail(costs: Array) -> Array:
+        particles = costs.shape[1]
+        order = jnp.argsort(-jnp.mean(costs, 0))
+        rank = jnp.argsort(order)  # 0: the costliest
+        share = jnp.clip(fraction * particles - rank, 0, 1) / fraction
+        return aggregate(costs * share)
+
+    return tail

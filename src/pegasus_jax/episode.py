@@ -55,7 +55,7 @@ def uniform(key: Key, low: Array, high: Array, horizon: int) -> Array:
 def random_walk(key: Key, low: Array, high: Array, horizon: int, move: float = 0.3, pull: float = 0.75) -> Array:
     """Random controls [H, U]: with probability `move` a step goes `pull` of the way to a fresh uniform draw.
 
-    The exploration of the authors' swimmer scripts (reference settings 3.4).
+    The exploration of the authors' swimmer scripts (docs/reference.md 3.4).
     """
     fresh_key, move_key = jax.random.split(key)
     fresh = uniform(fresh_key, low, high, horizon)

@@ -68,7 +68,7 @@ def rows_of(data: Dataset, angles: tuple[int, ...]) -> Rows:
 
 
 def start(outputs: int, features: int) -> dict[str, Array]:
-    """The logarithms of the hyperparameters of the authors' start (reference settings 6): 1, 1 and .1 of the data's
+    """The logarithms of the hyperparameters of the authors' start (docs/reference.md 6): 1, 1 and .1 of the data's
     standard deviations."""
     return {
         "log_lengthscale": jnp.zeros((outputs, features)),
@@ -90,7 +90,7 @@ def hyper(params: Params) -> Hyper:
 
 
 def penalty(h: Hyper, *, ratio: float = 1000, reach: float = 100, exponent: int = 30) -> Array:
-    """A wall around hyperparameters that no data justify (reference settings 6), summed over outputs.
+    """A wall around hyperparameters that no data justify (docs/reference.md 6), summed over outputs.
 
     Signal-to-noise ratios beyond `ratio` or 1 / `ratio`, and length scales beyond `reach` or 1 / `reach` standard
     deviations of the data; nothing of it is felt inside.

@@ -10,52 +10,60 @@ import optax
 from pegasus_jax.fit import FitInfo
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Fitter, Key, Learner, Params
 
+MEMORY = 10  # past steps from which the curvature is known
+
 
 class Descent(NamedTuple):
     """How far a minimisation got."""
 
     params: Params  # the best there were
-    value: Array  # [] theirs
+    value: Array  # [] theirs; infinite before the first step
     state: Any  # of the optimiser
-    failures: Array  # [] int32, steps in a row without progress
+    failures: Array  # [] int32, steps in a row without progress; it is over when they are 2
     skipped: Array  # [] int32, steps that ended where the function is not finite
     steps: Array  # [] int32 taken
 
 
-def minimise(function: Callable[[Params], Array], params: Params, steps: int, memory: int = 10) -> Descent:
-    """At most `steps` iterations of L-BFGS with a zoom line search (Nocedal & Wright 2006, alg. 7.4 and 3.5).
-
-    The value never rises. A step that gains nothing, or ends where the function is not finite, is not taken and the
-    curvature learned so far is forgotten; a second one in a row ends the descent, as does a gain below the precision of
-    the arithmetic.
-    """
-    optimizer = optax.lbfgs(memory_size=memory)
-    value_and_gradient = optax.value_and_grad_from_state(function)
-    first = function(params)
-    precision = max(2e-9, 4 * float(jnp.finfo(first.dtype).eps))
-
-    def step(d: Descent) -> Descent:
-        value, gradient = value_and_gradient(d.params, state=d.state)
-        updates, state = optimizer.update(gradient, d.state, d.params, value=value, grad=gradient, value_fn=function)
-        moved = optax.apply_updates(d.params, updates)
-        after = optax.tree.get(state, "value")
-        better = after < d.value
-        params, state = jax.tree.map(
-            lambda new, old: jnp.where(better, new, old), (moved, state), (d.params, optimizer.init(d.params))
-        )
-        gained = better & (d.value - after > precision * jnp.maximum(jnp.abs(d.value), 1))
-        return Descent(
-            params,
-            jnp.where(better, after, d.value),
-            state,
-            jnp.where(gained, 0, d.failures + 1),
-            d.skipped + ~jnp.isfinite(after),
-            d.steps + 1,
-        )
-
+def begin(params: Params) -> Descent:
+    """The descent from `params`, before its first step."""
     zero = jnp.int32(0)
-    begin = Descent(params, first, optimizer.init(params), zero, zero, zero)
-    return jax.lax.while_loop(lambda d: (d.steps < steps) & (d.failures < 2), step, begin)
+    return Descent(params, jnp.full((), jnp.inf), optax.lbfgs(memory_size=MEMORY).init(params), zero, zero, zero)
+
+
+def step(function: Callable[[Params], Array], d: Descent) -> tuple[Descent, tuple[Any, Params]]:
+    """One iteration of L-BFGS with a zoom line search (Nocedal & Wright 2006, alg. 7.4 and 3.5).
+
+    Also gives the value and the gradient where it began. The value never rises: a step that gains nothing, or ends
+    where the function is not finite, is not taken, and the curvature learned so far is forgotten. It is a failure, as
+    is a gain below the precision of the arithmetic.
+    """
+    optimizer = optax.lbfgs(memory_size=MEMORY)
+    value, gradient = optax.value_and_grad_from_state(function)(d.params, state=d.state)
+    updates, state = optimizer.update(gradient, d.state, d.params, value=value, grad=gradient, value_fn=function)
+    moved = optax.apply_updates(d.params, updates)
+    after = optax.tree.get(state, "value")
+    better = after < value
+    precision = max(2e-9, 4 * float(jnp.finfo(after.dtype).eps))
+    gained = better & (value - after > precision * jnp.maximum(jnp.abs(value), 1))
+    params, state = jax.tree.map(
+        lambda new, old: jnp.where(better, new, old), (moved, state), (d.params, optimizer.init(d.params))
+    )
+    ahead = Descent(
+        params,
+        jnp.where(better, after, value),
+        state,
+        jnp.where(gained, 0, d.failures + 1),
+        d.skipped + ~jnp.isfinite(after),
+        d.steps + 1,
+    )
+    return ahead, (value, gradient)
+
+
+def minimise(function: Callable[[Params], Array], params: Params, steps: int) -> Descent:
+    """At most `steps` steps from `params`; two failures in a row end the descent."""
+    return jax.lax.while_loop(
+        lambda d: (d.steps < steps) & (d.failures < 2), lambda d: step(function, d)[0], begin(params)
+    )
 
 
 def full_data(dynamics: Dynamics, *, starts: int) -> Fitter:

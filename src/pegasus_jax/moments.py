@@ -33,7 +33,7 @@ def mean_and_cov(x: Array) -> tuple[Array, Array]:
 def match(x: Array, z: Array) -> Array:
     """Particles [K, D] redrawn as mean + L z from the Gaussian fitted to x [K, D]; z [K, D] is standard normal.
 
-    Alg. 3 line 15, whose Sigma z is a slip of notation for L z with L L' = Sigma.
+    Alg. 3 line 14, whose Sigma z is a slip of notation for L z with L L' = Sigma.
     """
     mean, cov = mean_and_cov(x)
     return mean + z @ cholesky(cov).T

@@ -17,7 +17,7 @@ ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "silu": nn.
 
 
 def _small_uniform(key: jax.Array, shape: Sequence[int], dtype: object = None) -> Array:
-    return jax.random.uniform(key, shape, minval=-0.01, maxval=0.01)  # as the authors' (reference settings 4.1)
+    return jax.random.uniform(key, shape, minval=-0.01, maxval=0.01)  # as the authors' (docs/reference.md 4.1)
 
 
 class MLP(nn.Module):

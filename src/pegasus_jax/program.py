@@ -6,7 +6,12 @@ from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
 
+from pegasus_jax import mesh
 from pegasus_jax.types import Experiment
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
@@ -15,8 +20,8 @@ NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 class Jitted:
     """A jitted function that says how long compiling took; compiles once, or it is a defect."""
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self.function, self.compiled, self.seconds = jax.jit(function), None, 0.0
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
 
     def __call__(self, *arguments: Any) -> Any:
         if self.compiled is None:
@@ -27,25 +32,39 @@ class Jitted:
 
 
 class Program:
-    """An experiment over S seeds: every argument and result has a leading axis [S], except those that all share."""
+    """An experiment over S seeds: every argument and result has a leading axis [S], except those that all share.
 
-    def __init__(self, experiment: Experiment, search_steps: int, seeds: int = 1) -> None:
-        over = partial(over_seeds, seeds=seeds)
+    With a mesh, the seeds lie on its devices; those of several processes call every part together.
+    """
+
+    def __init__(self, experiment: Experiment, search_steps: int, seeds: int = 1, over: Mesh | None = None) -> None:
+        self.mesh = over
         self.chunk = chunk(search_steps)
         self.chunks = search_steps // self.chunk
+        functions = {
+            "init": (experiment.init, (0,)),
+            "episode": (experiment.episode, (0, 0, None)),
+            "absorb": (experiment.absorb, (0, 0)),
+            "fit": (experiment.fit, (0,)),
+            "search": (partial(experiment.search, steps=self.chunk), (0, None)),
+            "imagine": (experiment.imagine, (0,)),
+        }
+        self.axes = {name: axes for name, (_, axes) in functions.items()}
         self.parts = {
-            "init": Jitted(over(experiment.init, (0,))),
-            "episode": Jitted(over(experiment.episode, (0, 0, None))),
-            "absorb": Jitted(over(experiment.absorb, (0, 0))),
-            "fit": Jitted(over(experiment.fit, (0,))),
-            "search": Jitted(over(partial(experiment.search, steps=self.chunk), (0, None))),
-            "imagine": Jitted(over(experiment.imagine, (0,))),
+            name: Jitted(
+                over_seeds(function, axes, seeds=seeds),
+                **({} if over is None else {"out_shardings": mesh.over_seeds(over)}),
+            )
+            for name, (function, axes) in functions.items()
         }
         self.spent: dict[str, float] = {}
 
     def __call__(self, part: str, *arguments: Any, purpose: str | None = None) -> Any:
         """Run a part; its time is counted as that of `purpose`."""
         jitted, name = self.parts[part], purpose or part
+        if self.mesh is not None:
+            layouts = [mesh.shared(self.mesh) if a is None else mesh.over_seeds(self.mesh) for a in self.axes[part]]
+            arguments = tuple(placed(*pair) for pair in zip(arguments, layouts, strict=True))
         began, compiled = time.monotonic(), jitted.seconds
         result = jitted(*arguments)
         compiling = jitted.seconds - compiled
@@ -65,7 +84,7 @@ def over_seeds(function: Callable[..., Any], axes: tuple[int | None, ...], *, se
     `axes` is 0 for an argument with that axis, None for one that all seeds share.
     """
     if seeds > 1:
-        return jax.vmap(function, axes)
+        return jax.vmap(function, axes, spmd_axis_name=mesh.SEEDS)
 
     def alone(*arguments: Any) -> Any:
         own = (
@@ -75,6 +94,39 @@ def over_seeds(function: Callable[..., Any], axes: tuple[int | None, ...], *, se
         return jax.tree.map(lambda leaf: leaf[None], function(*own))
 
     return alone
+
+
+def placed(tree: Any, layout: NamedSharding) -> Any:
+    """The tree's arrays laid out over devices; arrays that other processes hold too are equal there."""
+
+    def put(leaf: Any) -> Any:
+        if isinstance(leaf, jax.Array) and leaf.sharding.is_equivalent_to(layout, leaf.ndim):
+            return leaf
+        if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable:
+            return jax.device_put(leaf, layout)
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(put(np.asarray(jax.random.key_data(leaf))))
+        return jax.device_put(np.asarray(leaf), layout)
+
+    return jax.tree.map(put, tree)
+
+
+def fetched(tree: Any) -> Any:
+    """The tree's arrays whole on this process, whatever devices of whatever process hold them."""
+    if jax.process_count() == 1:
+        return tree
+
+    def get(leaf: Any) -> Any:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(get(jax.random.key_data(leaf)))
+        return jnp.asarray(multihost_utils.process_allgather(leaf, tiled=True))
+
+    return jax.tree.map(get, tree)
+
+
+def leads() -> bool:
+    """Whether this process is the one that writes files and speaks."""
+    return jax.process_index() == 0
 
 
 def chunk(steps: int) -> int:

@@ -14,8 +14,8 @@ from pegasus_jax.types import Array
 class Display:
     """Shows where a run is. `phase` and `advance` move the live line; `line` prints one that stays."""
 
-    def __init__(self, trials: int, done: int, console: Console | None = None) -> None:
-        self.console = console or Console(file=sys.stderr, highlight=False)
+    def __init__(self, trials: int, done: int, console: Console | None = None, quiet: bool = False) -> None:
+        self.console = console or Console(file=sys.stderr, highlight=False, quiet=quiet)
         self.trials, self.done, self.began = trials, done, time.monotonic()
         self.ran = 0.0  # trials finished here, in fractions
         self.live: Progress | None = None

@@ -10,7 +10,7 @@ from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenario
 
 
 class NoiseUse(NamedTuple):
-    """Where the model's predicted observation noise enters a rollout, as factors of it (reference settings 5.4)."""
+    """Where the model's predicted observation noise enters a rollout, as factors of it (docs/reference.md 5.4)."""
 
     policy: float = 1.0  # the policy sees x_t + factor * std_t * noise_t
     state: float = 0.0  # the state itself moves by factor * std * noise
@@ -26,18 +26,22 @@ def rollout(
     policy: Policy,
     match: Callable[[Array, Array], Array],
     noise: NoiseUse = NoiseUse(),
+    truncate: int | None = None,
 ) -> Rollout:
-    """Roll K particles out for H steps (Alg. 3 lines 6 to 15).
+    """Roll K particles out for H steps (Alg. 3 lines 6 to 14).
 
     Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match` is
-    `moments.match` or `moments.keep`. No gradient flows through the predicted noise.
+    `moments.match` or `moments.keep`. No gradient flows through the predicted noise, nor, with `truncate`, through
+    the states 0, truncate, 2 truncate, ...: truncated back-propagation through time.
     """
     act = jax.vmap(policy.apply, (None, 0, 0))
     predict = jax.vmap(dynamics.apply, (None, 0, 0, 0))
 
-    def step(carry: tuple[Array, Array], draws: tuple[Array, Array]) -> tuple[tuple[Array, Array], tuple]:
+    def step(carry: tuple[Array, Array], draws: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple]:
         x, blur = carry
-        sensor, redraw = draws
+        t, sensor, redraw = draws
+        if truncate is not None:
+            x = jnp.where(t % truncate == 0, jax.lax.stop_gradient(x), x)
         u = act(policy_params, scenarios.policy, x + noise.policy * blur)
         change = predict(belief, scenarios.dynamics, x, u)
         std = jax.lax.stop_gradient(change.std)
@@ -46,5 +50,7 @@ def rollout(
         return (after, blur), (after, u, std, after + noise.cost * blur)
 
     start = scenarios.start
-    _, (x, u, std, seen) = jax.lax.scan(step, (start, jnp.zeros_like(start)), (scenarios.sensor, scenarios.match))
+    times = jnp.arange(scenarios.match.shape[0])
+    draws = (times, scenarios.sensor, scenarios.match)
+    _, (x, u, std, seen) = jax.lax.scan(step, (start, jnp.zeros_like(start)), draws)
     return Rollout(jnp.concatenate([start[None], x]), u, std, seen)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from pegasus_jax.mesh import Spread, together
 from pegasus_jax.moments import standardise
 from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, Scenarios
 
@@ -23,21 +24,28 @@ class Blocks(NamedTuple):
 
 
 def blocks(
-    *, dynamics: Dynamics, policy: Policy, start: Callable[[Key], Array], particles: int, horizon: int, balanced: bool
+    *,
+    dynamics: Dynamics,
+    policy: Policy,
+    start: Callable[[Key], Array],
+    particles: int,
+    horizon: int,
+    balanced: bool,
+    spread: Spread = together,
 ) -> Blocks:
     """How each part of the scenarios is drawn.
 
     With `balanced`, the normal draws of every time step have exactly zero mean and unit covariance over the particles,
-    so that matched particles have exactly the moments asked for.
+    so that matched particles have exactly the moments asked for. `spread` lays particles out over devices (mesh.py).
     """
 
     def each(sample: Callable[[Key], Params]) -> Callable[[Key], Params]:
-        return lambda key: jax.vmap(sample)(jax.random.split(key, particles))
+        return lambda key: spread(jax.vmap(sample)(jax.random.split(key, particles)), 0)
 
     def normal(key: Key, _: Params) -> Array:
         states = jax.eval_shape(start, key).shape[0]
         z = jax.random.normal(key, (horizon, particles, states))
-        return standardise(z) if balanced else z
+        return spread(standardise(z) if balanced else z, 1)
 
     return Blocks(
         start=lambda key, _: each(start)(key),

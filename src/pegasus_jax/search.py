@@ -15,6 +15,30 @@ from pegasus_jax.scenarios import Blocks, draw, redraw
 from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Period, Policy, Scenarios, Searcher
 
 
+class Remembering(NamedTuple):
+    """State of an optimiser that remembers the best parameters it has seen."""
+
+    inner_state: optax.OptState
+    best_value: Array  # [] the lowest objective so far
+    best_params: Params  # that had it
+
+
+def remembering(optimizer: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
+    """The optimiser, which also remembers the parameters with the lowest `value`; see `keeping_best`."""
+    optimizer = optax.with_extra_args_support(optimizer)
+
+    def init(params: Params) -> Remembering:
+        return Remembering(optimizer.init(params), jnp.full((), jnp.inf), params)
+
+    def update(updates: Params, state: Any, params: Params = None, *, value: Array, **extra: Any) -> tuple[Params, Any]:
+        updates, inner = optimizer.update(updates, state.inner_state, params, value=value, **extra)
+        better = value < state.best_value
+        kept = jax.tree.map(partial(jnp.where, better), params, state.best_params)
+        return updates, Remembering(inner, jnp.where(better, value, state.best_value), kept)
+
+    return optax.GradientTransformationExtraArgs(init, update)  # type: ignore[arg-type]
+
+
 class SearchInfo(NamedTuple):
     """How a search went, iteration by iteration."""
 
@@ -34,9 +58,19 @@ def objective(
     cost: Callable[[Array], Array],
     aggregate: Callable[[Array], Array] = costs.mean,
     noise: NoiseUse = NoiseUse(),
+    truncate: int | None = None,
 ) -> Array:
-    """J(theta) (Alg. 3 line 16): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
-    imagined = rollout(policy_params, belief, scenarios, dynamics=dynamics, policy=policy, match=match, noise=noise)
+    """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
+    imagined = rollout(
+        policy_params,
+        belief,
+        scenarios,
+        dynamics=dynamics,
+        policy=policy,
+        match=match,
+        noise=noise,
+        truncate=truncate,
+    )
     return aggregate(cost(imagined.seen))
 
 
@@ -52,17 +86,18 @@ def optimise(
     steps: int,
     first: Array | int = 0,
 ) -> tuple[Learner, SearchInfo]:
-    """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 20).
+    """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 19).
 
     One call of n steps and two calls of n/2, the second with first=n/2, do the same.
     """
     first = jnp.asarray(first, jnp.int32)
+    optimizer = optax.with_extra_args_support(optimizer)
     before = skipped(learner.optimizer)
 
     def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], tuple[Array, Array]]:
         learner, scenarios = carry
         value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios)
-        updates, state = optimizer.update(gradient, learner.optimizer, learner.params)
+        updates, state = optimizer.update(gradient, learner.optimizer, learner.params, value=value)
         learner = Learner(optax.apply_updates(learner.params, updates), state)
         scenarios = redraw(key, i + 1, scenarios, belief)
         return (learner, scenarios), (value, optax.tree.norm(gradient))
@@ -92,3 +127,22 @@ def particles(
         run=partial(optimise, **pieces),
         value=lambda key, params, belief: objective(params, belief, pieces["draw"](key, 0, belief)),
     )
+
+
+def keeping_best(searcher: Searcher, last: int) -> Searcher:
+    """The searcher that ends a trial's search of `last` iterations with the best parameters it met, not the last.
+
+    Its optimiser must be `remembering`. Values are compared as they are, like the authors' option to return the best:
+    with redrawn scenarios each is noisy, so the lowest is partly luck, and not as good as it looks.
+    """
+
+    def run(key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int) -> tuple[Learner, Any]:
+        known = optax.tree.get(learner.optimizer, "best_value")
+        known = jnp.where(jnp.asarray(first) == 0, jnp.inf, known)  # what an older model thought does not count
+        learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, best_value=known))
+        learner, info = searcher.run(key, learner, belief, first=first, steps=steps)
+        best = optax.tree.get(learner.optimizer, "best_params")
+        kept = jax.tree.map(partial(jnp.where, first + steps >= last), best, learner.params)
+        return learner._replace(params=kept), info
+
+    return searcher._replace(run=run)

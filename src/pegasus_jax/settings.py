@@ -166,6 +166,8 @@ def _kind(annotation: Any) -> str:
         bool: "true or false",
         str: "a word",
         tuple[int, ...]: "a list of whole numbers",
+        tuple[float, ...]: "a list of numbers",
+        tuple[str, ...]: "a list of words",
         str | None: "a word or null",
         int | None: "a whole number or null",
     }.get(annotation, "a number or null")

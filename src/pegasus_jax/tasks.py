@@ -1,14 +1,17 @@
 """Task names -> tasks. The only importer of pegasus_envs."""
 
+import dataclasses
 import os
 import sys
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
 
+from pegasus_envs import mjcf
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.goals import Task as Manoeuvre
@@ -17,7 +20,7 @@ from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
 from pegasus_jax.config import Config, SettingError, nearest
-from pegasus_jax.cost import saturating
+from pegasus_jax.cost import expected_saturating, saturating
 from pegasus_jax.types import Task
 
 
@@ -37,6 +40,7 @@ def of_plant(name: str, plant: Plant) -> Task:
         dt=plant.dt,
         state_names=plant.state_names,
         control_names=plant.control_names,
+        expected_cost=expected_saturating(plant.error, plant.width, plant.angles),
     )
 
 
@@ -48,9 +52,10 @@ TASKS: dict[str, Callable[[Any], Plant]] = {
 }
 
 GYM = "gym"  # the task that `env=` and `cost=` describe
-NAMES = (*TASKS, GYM)
+MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe
+NAMES = (*TASKS, GYM, MJCF)
 
-# Reference settings 2.2; the paper's networks and step size.
+# docs/reference.md 2.2; the paper's networks and step size.
 _DOUBLE_CARTPOLE: dict[str, Any] = {
     "trials": 40,
     "model.hidden": (200,) * 4,
@@ -59,7 +64,7 @@ _DOUBLE_CARTPOLE: dict[str, Any] = {
     "explore.trials": 2,
 }
 
-# Reference settings 3.4; what the legs do not change. The policy's dropout is the paper's .1, as everywhere.
+# docs/reference.md 3.4; what the legs do not change. The policy's dropout is the paper's .1, as everywhere.
 _SWIMMER: dict[str, Any] = {
     "trials": 50,
     "model.hidden": (200,) * 4,
@@ -79,7 +84,7 @@ _LEGS: dict[int, dict[str, Any]] = {
 
 def defaults(name: str, legs: int = 2) -> dict[str, Any]:
     """What a task changes in the defaults of config.py, by dotted name."""
-    if name in ("cartpole", GYM):
+    if name in ("cartpole", GYM, MJCF):
         return {}
     if name == "double_cartpole":
         return _DOUBLE_CARTPOLE
@@ -96,7 +101,23 @@ def make(name: str, legs: int = 2) -> Task:
 
 def of_config(config: Config) -> Task:
     """The task that a config names."""
-    return of_guest(config) if config.task == GYM else make(config.task, config.legs)
+    own = {GYM: of_guest, MJCF: of_mjcf}
+    return own[config.task](config) if config.task in own else make(config.task, config.legs)
+
+
+def label(config: Config) -> str:
+    """The task with what tells it from others of its name, as part of a folder's name."""
+    if config.task.startswith("swimmer_"):
+        return f"{config.task}-legs{config.legs}"
+    own = {GYM: config.env, MJCF: Path(config.mjcf or "").stem}.get(config.task)
+    return f"{config.task}-{own}".replace("/", "-").replace(":", "-") if own else config.task
+
+
+def pinned(config: Config) -> Config:
+    """The config for a run's folder: it finds its MJCF file from anywhere, and knows it by its content."""
+    if config.task != MJCF or config.mjcf is None:
+        return config
+    return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf), mjcf_digest=mjcf.digest(_model(config)))
 
 
 def of_guest(config: Config) -> Task:
@@ -107,26 +128,60 @@ def of_guest(config: Config) -> Task:
         plant = guest(config.env)
     except ValueError as error:
         raise SettingError(f"env={config.env}: {error}") from error
-    states, controls = len(plant.start_mean), len(plant.control_low)
+    states = tuple(f"x{i}" for i in range(len(plant.start_mean)))
+    controls = tuple(f"u{i}" for i in range(len(plant.control_low)))
+    return _of_users(config, config.env, plant, config.horizon or plant.horizon, states, controls)
+
+
+def of_mjcf(config: Config) -> Task:
+    """The task that an MJCF file and a cost of its observations pose. Raises SettingError if they cannot."""
+    if None in (config.mjcf, config.cost, config.dt, config.horizon):
+        raise SettingError(
+            "task=mjcf needs mjcf=, cost=, dt= and horizon=; for example "
+            "mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40"
+        )
+    model = _model(config)
+    if config.mjcf_digest not in (None, mjcf.digest(model)):
+        raise SettingError(f"mjcf={config.mjcf} is not what the run began with: its mjcf_digest differs")
+    names = ("observe", "control_low", "control_high", "start_mean", "start_std")
+    try:
+        plant = mjcf.mechanism(model, config.dt or 0.0, **{name: getattr(config, name) for name in names})
+    except ValueError as error:
+        raise SettingError(f"mjcf={config.mjcf}: {error}") from error
+    name = Path(config.mjcf or "").stem
+    return _of_users(config, name, plant, config.horizon or 0, plant.state_names, plant.control_names)
+
+
+def _model(config: Config) -> Any:
+    try:
+        return mjcf.read(Path(config.mjcf or ""))
+    except ValueError as error:
+        raise SettingError(f"mjcf={config.mjcf}: {error}") from error
+
+
+def _of_users(
+    config: Config, name: str, plant: Any, horizon: int, states: tuple[str, ...], controls: tuple[str, ...]
+) -> Task:
+    """The task that a user's plant poses with the cost and the angles that the config names."""
     for angle in config.angles:
-        if not 0 <= angle < states:
+        if not 0 <= angle < len(states):
             raise SettingError(
-                f"angles={angle} is not an entry of {config.env}'s observation; choose from 0 to {states - 1}"
+                f"angles={angle} is not an entry of {name}'s observation; choose from 0 to {len(states) - 1}"
             )
     return Task(
-        name=config.env,
+        name=name,
         plant=plant,
-        cost=_function(config.cost),
+        cost=_function(config.cost or ""),
         angles=config.angles,
         start_mean=plant.start_mean,
         start_std=plant.start_std,
-        sensor_std=np.zeros(states),
+        sensor_std=np.zeros(len(states)),
         control_low=plant.control_low,
         control_high=plant.control_high,
-        horizon=config.horizon or plant.horizon,
+        horizon=horizon,
         dt=plant.dt,
-        state_names=tuple(f"x{i}" for i in range(states)),
-        control_names=tuple(f"u{i}" for i in range(controls)),
+        state_names=states,
+        control_names=controls,
     )
 
 

@@ -10,13 +10,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh
 from tensorboardX import SummaryWriter
 
 from pegasus_jax import checkpoint, record, settings
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.config import Config, SettingError
 from pegasus_jax.dataset import grow
-from pegasus_jax.program import Program
+from pegasus_jax.program import Program, fetched, leads
 from pegasus_jax.progress import Display
 from pegasus_jax.record import RunError
 from pegasus_jax.trial import COLLECT, EVALUATE, trial_key
@@ -34,44 +36,49 @@ def train(config: Config, run: Path, *, resume: bool = False, command: str = "")
     return part(train_seeds(config, {config.seed: run}, resume=resume, command=command), 0)
 
 
-def train_seeds(config: Config, runs: dict[int, Path], *, resume: bool = False, command: str = "") -> RunState:
+def train_seeds(
+    config: Config, runs: dict[int, Path], *, resume: bool = False, command: str = "", mesh: Mesh | None = None
+) -> RunState:
     """`train` for the seeds and folders of `runs`, all as one program; returns their states [S, ...].
 
     Each folder is what a run of that seed alone would leave, and can be resumed alone. The seeds share nothing but the
     clock: one that diverges leaves the others as they are. All go on from the newest trial that all have finished.
+    With a `mesh` (mesh.py) of several devices the seeds are shared out among them; where several processes hold the
+    devices, all call this together, see the same files, and the first one writes.
     """
     folders, seeds = list(runs.values()), list(runs)
     with ExitStack() as held:
-        for run in folders:
+        for run in folders if leads() else ():
             held.enter_context(record.lock(run))
         before = settings.load(folders[0] / "config.yaml") if resume else config
         if config.trials < before.trials:
             raise SettingError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
         set_precision(config)
-        experiment = build(replace(config, seed=0))  # the seed is in the key, so that all share one program
-        program = Program(experiment, config.search.steps, len(seeds))
-        states = program("init", jnp.stack([jax.random.key(seed) for seed in seeds]))
-        display = Display(config.trials, 0)
-        if resume:
-            states = together(folders, replace(before, seed=0), display) or states
-            room = config.trials * experiment.task.horizon
+        experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
+        program = Program(experiment, config.search.steps, len(seeds), mesh)
+        display = Display(config.trials, 0, quiet=not leads())
+        states = together(folders, replace(before, seed=0), display) if resume else None
+        if states is None:
+            states = program("init", jnp.stack([jax.random.key(seed) for seed in seeds]))
+        room = config.trials * experiment.task.horizon
+        if room > states.data.x.shape[1]:
             states = states._replace(data=jax.vmap(partial(grow, capacity=room))(states.data))
-        done = int(states.trial[0])
-        for seed, run in runs.items():
+        done = display.done = int(fetched(states.trial)[0])
+        multihost_utils.sync_global_devices("every process has read what there is")
+        boards = []
+        for seed, run in runs.items() if leads() else ():
             settings.save(replace(config, seed=seed), run / "config.yaml")
             record.write_json(run / "run.json", record.about(command))
             record.write_trials(run, record.trials(run)[:done])
-        display.done = done
+            boards.append(held.enter_context(SummaryWriter(str(run / "tensorboard"), purge_step=done + 1)))
         with display.running():
-            boards = [
-                held.enter_context(SummaryWriter(str(run / "tensorboard"), purge_step=done + 1)) for run in folders
-            ]
             for trial in range(done + 1, config.trials + 1):
                 states, rows = one_trial(states, trial, config, folders, experiment, program, display)
-                for index, (run, row, board) in enumerate(zip(folders, rows, boards, strict=True)):
-                    record.write_trials(run, [*record.trials(run), row])
-                    scalars(board, row)
-                    checkpoint.save(run, trial, part(states, index))
+                whole = fetched(states)
+                for index, board in enumerate(boards):
+                    record.write_trials(folders[index], [*record.trials(folders[index]), rows[index]])
+                    scalars(board, rows[index])
+                    checkpoint.save(folders[index], trial, part(whole, index))
                 display.line(summary(rows, config.trials))
     return states
 
@@ -91,20 +98,20 @@ def one_trial(
     episodes = collected(states, trial, config, runs, task, program)
     states = program("absorb", states, jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes))
     display.phase(trial, "fit", 0.02)
-    states, fitted = program("fit", states)
+    states, fitted = fetched_info(program("fit", states))
     found = []
     for i in range(program.chunks):
         cost = np.mean(found[-1].objective[:, -1]) if found else None
         display.phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)
-        states, searched = program("search", states, jnp.int32(i * program.chunk))
+        states, searched = fetched_info(program("search", states, jnp.int32(i * program.chunk)))
         found.append(jax.tree.map(np.asarray, searched))
     objective, norm = (np.concatenate([getattr(f, name) for f in found], 1) for name in ("objective", "gradient_norm"))
     skipped = fitted.skipped + sum(f.skipped for f in found)
     display.phase(trial, "evaluate", 0.9)
-    imagined, imagined_cost = program("imagine", states)
-    for index, run in enumerate(runs):
+    imagined, imagined_cost = fetched(program("imagine", states))
+    for index, run in enumerate(runs if leads() else ()):
         record.save_imagined(run, trial, part(imagined, index), imagined_cost[index])
-    keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(states.key)
+    keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(fetched(states.key))
     evaluation = evaluate(keys, states.policy.params, task, partial(program, "episode", purpose="evaluate"), EPISODES)
     seconds = program.seconds()
     rows = [
@@ -134,23 +141,24 @@ def collected(
     """The episodes of a trial: those on disk as they are, the others run on the plant and made durable."""
     episodes = [record.load_episode(run, trial) for run in runs]
     if any(episode is None for episode in episodes):
-        keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(states.key)
+        keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(fetched(states.key))
         exploring = jnp.asarray(trial <= config.explore.trials)
-        fresh = program("episode", keys, states.policy.params, exploring, purpose="collect")
+        fresh = fetched(program("episode", keys, states.policy.params, exploring, purpose="collect"))
         for index, run in enumerate(runs):
             if episodes[index] is None:
                 episodes[index] = part(fresh, index)
-                record.save_episode(run, trial, part(fresh, index), task)
+                if leads():
+                    record.save_episode(run, trial, part(fresh, index), task)
     return [episode for episode in episodes if episode is not None]
 
 
 def evaluate(
     keys: Key, params: Params, task: Task, episode: Callable[..., Trajectory], episodes: int
 ) -> list[dict[str, float]]:
-    """Mean cost a step and success rate of each seed [S], over fresh episodes that are not data."""
+    """Mean cost a step and success rate of each seed [S], over fresh episodes, not data (docs/reference.md 10)."""
     follow = jnp.asarray(False)  # the policy, not random controls
     each = jax.vmap(lambda key: jax.random.split(key, episodes), out_axes=1)(keys)
-    costs = np.stack([np.asarray(episode(some, params, follow).cost) for some in each], axis=1)  # [S, E, H]
+    costs = np.stack([np.asarray(fetched(episode(some, params, follow).cost)) for some in each], axis=1)  # [S, E, H]
     success = np.mean(costs[..., -5:], axis=-1) < task.success
     return [
         {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(succeeded))}
@@ -164,6 +172,12 @@ def saturated(episode: Trajectory, task: Task) -> float:
     margin = 0.01 * (high - low)
     u = np.asarray(episode.u)
     return float(np.mean((u < low + margin) | (u > high - margin)))
+
+
+def fetched_info(result: tuple[RunState, Any]) -> tuple[RunState, Any]:
+    """The states where they lie, and the info on this process."""
+    states, info = result
+    return states, fetched(info)
 
 
 def part(tree: Any, index: int) -> Any:

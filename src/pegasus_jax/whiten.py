@@ -16,7 +16,7 @@ class Whitener(NamedTuple):
 
 
 def whitener(rows: Array, size: Array, *, full: bool = True, jitter: float = 1e-6) -> Whitener:
-    """The whitener of the first `size` rows of rows [N, F] (reference settings 4.6).
+    """The whitener of the first `size` rows of rows [N, F] (docs/reference.md 4.6).
 
     With `full`, the root is the Cholesky factor of the rows' covariance; otherwise it is diagonal. `jitter` is relative
     to each column's variance and keeps columns that hardly vary (an angle before it has moved) invertible.

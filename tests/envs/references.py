@@ -3,7 +3,6 @@
 from typing import Any, NamedTuple
 
 import jax
-import mujoco
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -89,25 +88,3 @@ def energy(xs: np.ndarray) -> np.ndarray:
         total += 0.5 * MASS * LENGTH**2 / 12 * w**2
         vx, vz, height = vx + dx, vz + dz, height + rise
     return total
-
-
-def in_c(plant: Plant, qpos: np.ndarray, qvel: np.ndarray, controls: np.ndarray, drive=None):
-    """C MuJoCo's positions, velocities after each period, and velocities of each time step, in double precision.
-
-    `drive(control)` yields the actuator commands of each time step of one period; by default they are held.
-    """
-    data = mujoco.MjData(plant.model)
-    data.qpos[:], data.qvel[:] = qpos, qvel
-    count = round(plant.dt / plant.model.opt.timestep)
-    drive = drive or (lambda control: [control] * count)
-    positions, velocities, within = [], [], []
-    for control in np.asarray(controls, float):
-        steps = []
-        for command in drive(control):
-            data.ctrl[:] = command
-            mujoco.mj_step(plant.model, data)
-            steps.append(data.qvel.copy())
-        positions.append(data.qpos.copy())
-        velocities.append(data.qvel.copy())
-        within.append(steps)
-    return np.stack(positions), np.stack(velocities), np.stack(within)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks.in_c import in_c
 from envs import references
 from envs.references import simulated
 from pegasus_envs import physics
@@ -25,7 +26,7 @@ def errors(system, seed: int) -> tuple[np.ndarray, np.ndarray]:
     state, controls = system.plant.place(system.plant.start_mean.astype(np.float32)), system.random(seed)
     xs = np.asarray(system.run(state, controls), float)
     exact = references.integrate(RATES[xs.shape[1]], xs[0], controls)
-    qpos, qvel, _ = references.in_c(system.plant, state.qpos, state.qvel, controls)
+    qpos, qvel, _ = in_c(system.plant, state.qpos, state.qvel, controls)
     c = np.stack([system.plant.observe(physics.Motion(q, v)) for q, v in zip(qpos, qvel, strict=True)])
     return np.abs(xs - exact).max(axis=1)[1:], np.abs(xs[1:] - c).max(axis=1)
 
@@ -143,6 +144,21 @@ def test_constants_can_be_mapped_over(cart):
     assert physics.default("cartpole.xml").opt.gravity[2] == -9.82
 
 
+def test_constants_of_the_double_cartpole_can_be_mapped_over(double):
+    lengths, masses = jnp.array([0.6, 0.9]), jnp.array([0.5, 0.8])
+    state, controls = double.start(1), double.random(1, 10)
+    run = jax.vmap(
+        lambda l, m: simulate(double_cartpole(outer_length=l, inner_mass=m, friction=0.2 * l), state, controls)
+    )
+    xs = jax.jit(run)(lengths, masses)
+    for x, length, mass in zip(xs, lengths.tolist(), masses.tolist(), strict=True):
+        plant = double_cartpole(outer_length=length, inner_mass=mass, friction=0.2 * length)
+        qpos, qvel, _ = in_c(plant, state.qpos, state.qvel, controls)
+        exact = [plant.observe(physics.Motion(q, v)) for q, v in zip(qpos, qvel, strict=True)]
+        np.testing.assert_allclose(x[1:], exact, atol=1e-3)
+    assert np.abs(xs[0, -1] - xs[1, -1]).max() > 0.1
+
+
 def test_start_has_the_stated_spread(cart):
     x = jax.vmap(lambda key: cart.plant.observe(cart.plant.reset(key)))(jax.random.split(jax.random.key(0), 4000))
     np.testing.assert_allclose(x.mean(axis=0), cart.plant.start_mean, atol=0.02)
@@ -154,10 +170,11 @@ def test_place_is_the_inverse_of_observe(system):
     np.testing.assert_allclose(system.plant.observe(system.plant.place(x)), x, atol=1e-6)
 
 
-def test_gradient_matches_finite_differences():
+@pytest.mark.parametrize("construct", [cartpole, double_cartpole])
+def test_gradient_matches_finite_differences(construct):
     with jax.enable_x64(True):
-        plant = cartpole()
-        state = plant.place(jnp.array([0.1, -0.2, 0.3, 0.4]))
+        plant = construct()
+        state = plant.place(jnp.array([0.1, -0.2, 0.3, 0.4, 1.0, 2.0])[: len(plant.start_mean)])
         controls = jnp.asarray(np.random.default_rng(0).uniform(-8, 8, (5, 1)))
         final = jax.jit(lambda force: simulate(plant, state, controls.at[1, 0].set(force))[-1])
         gradient = jax.jit(jax.jacfwd(final))(2.0)

@@ -5,11 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs import references
-from envs.feedback import GAINS, feedback
+from benchmarks.feedback import GAINS, episodes
+from benchmarks.in_c import in_c, stroke
 from pegasus_envs.attitude import angles_of, quaternion_of
 from pegasus_envs.plant import saturating, simulate
-from pegasus_envs.swimmer import HIPS, LAG, Swimming, hip_angles, swimmer
+from pegasus_envs.swimmer import HIPS, LAG, hip_angles, swimmer
 
 STEP = 0.01
 
@@ -18,29 +18,10 @@ def legs_of(plant) -> int:
     return 2 if len(plant.control_low) == 4 else 6
 
 
-def drive(legs: int):
-    """Actuator commands of each time step, written anew from the description: a filter, then a sine of the time."""
-    command, time = np.zeros((3, 6)), 0.0
-
-    def period(control: np.ndarray):
-        nonlocal command, time
-        target = np.zeros((3, 6))
-        if legs == 2:
-            target[:2, [2, 5]] = control.reshape(2, 2)
-        else:
-            target[:] = control.reshape(3, 6)
-        for _ in range(100 if legs == 2 else 50):
-            command = target + np.exp(-STEP / LAG) * (command - target)
-            yield command[1] + command[0] * np.sin(2 * np.pi * 4.0 * time + command[2])
-            time += STEP
-
-    return period
-
-
 def test_follows_c_for_twenty_seconds(swim):
     plant, state, controls = swim.plant, swim.start(0), swim.random(0)
     xs = np.asarray(swim.run(state, controls), float)
-    qpos, _, within = references.in_c(plant, state.qpos, state.qvel, controls, drive(legs_of(plant)))
+    qpos, _, within = in_c(plant, state.qpos, state.qvel, controls, stroke(legs_of(plant)))
     rates = within[:, -25:, 3:6].mean(axis=1)
     exact = np.hstack([[angles_of(q[3:7]) for q in qpos], -qpos[:, 2:3], rates])
     angle = (xs[1:, :3] - exact[:, :3] + np.pi) % (2 * np.pi) - np.pi
@@ -141,9 +122,21 @@ def test_constants_can_be_mapped_over(swim):
     mapped = jax.jit(jax.vmap(final))(jnp.array([15.0, 18.0, 15.0]), jnp.array([1000.0, 1000.0, 800.0]))
     np.testing.assert_allclose(mapped[0], swim.run(state, controls)[-1], atol=1e-4)
     heavy = swimmer("knife_edge", legs, hull_mass=18.0)
-    qpos, *_ = references.in_c(heavy, state.qpos, state.qvel, controls, drive(legs))
+    qpos, *_ = in_c(heavy, state.qpos, state.qvel, controls, stroke(legs))
     np.testing.assert_allclose(mapped[1, 3], -qpos[-1, 2], atol=1e-4)
     assert np.abs(np.diff(mapped, axis=0)).max(axis=1).min() > 1e-3
+
+
+def test_gradient_matches_finite_differences():
+    with jax.enable_x64(True):
+        plant = swimmer("knife_edge", 6)
+        state = plant.place(jnp.asarray(plant.start_mean + 0.1))
+        control = jnp.asarray(0.5 * plant.control_high)
+        final = jax.jit(lambda offset: plant.observe(plant.step(state, control.at[7].set(offset))))
+        gradient = jax.jit(jax.jacfwd(lambda offset: plant.observe(plant.step(state, control.at[7].set(offset)))))(0.2)
+        step = 1e-5
+        np.testing.assert_allclose(gradient, (final(0.2 + step) - final(0.2 - step)) / (2 * step), rtol=1e-5, atol=1e-7)
+        assert np.abs(gradient[:4]).min() > 1e-5
 
 
 # Mean |e|^2 over 20 s, from starts not used in the search; a random policy has more than .9 in all of them.
@@ -165,21 +158,11 @@ def test_every_manoeuvre_can_be_done(swim):
     tasks = [task for some, task in BARS if some == legs]
     plants = {task: swimmer(task, legs) for task in tasks}
 
-    def episode(state: Swimming, gains, index):
-        def advance(state, _):
-            laws = [
-                lambda x, task=task: feedback(gains, x, task, legs, 2.0 if task == "depth_change" else 1.0)
-                for task in tasks
-            ]
-            state = base.step(state, jax.lax.switch(index, laws, base.observe(state)))
-            return state, base.observe(state)
-
-        return jax.lax.scan(advance, state, None, length=base.horizon)[1]
-
     states = jax.vmap(base.reset)(jax.random.split(jax.random.key(77), starts))
     states = jax.tree.map(lambda leaf: jnp.tile(leaf, (len(tasks),) + (1,) * (leaf.ndim - 1)), states)
     gains = jnp.repeat(jnp.asarray([GAINS[legs, task] for task in tasks]), starts, axis=0)
-    xs = jax.jit(jax.vmap(episode))(states, gains, jnp.repeat(jnp.arange(len(tasks)), starts))
+    fly = jax.jit(lambda which, gains, states: episodes(base, tasks, which, gains, states))
+    xs = fly(jnp.repeat(jnp.arange(len(tasks)), starts), gains, states)
     for task, x in zip(tasks, np.asarray(xs).reshape(len(tasks), starts, base.horizon, -1), strict=True):
         errors = np.asarray(jax.vmap(jax.vmap(plants[task].error))(jnp.asarray(x)))
         squares = (errors**2).sum(axis=-1)

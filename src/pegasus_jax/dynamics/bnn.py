@@ -1,4 +1,4 @@
-"""Bayesian neural network dynamics: a network with multiplicative noise on its units (paper, section IV-C)."""
+"""Bayesian neural network dynamics: a network with multiplicative noise on its units (paper, sections IV-A and V-C)."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -30,7 +30,7 @@ class Belief(NamedTuple):
 Head = Callable[[Array], Array]  # raw output [D] -> noise std as a fraction of the target's scale
 
 HEADS: dict[str, Head] = {
-    # At most a tenth of the target's scale, as in the authors' final code (reference settings 4.5).
+    # At most a tenth of the target's scale, as in the authors' final code (docs/reference.md 4.5).
     "sigmoid": lambda raw: 0.1 * jax.nn.sigmoid(raw) + 1e-6,
     "softplus": lambda raw: jax.nn.softplus(raw) + 1e-6,
 }
@@ -56,7 +56,7 @@ def bnn(
 
     Layer i multiplies its input by noise of `dropout`; the network's own inputs carry `input_dropout`, or none. With
     `heteroscedastic` the noise std is a function of the input, otherwise one vector of parameters. `kl_weight`
-    and `weight_decay` scale the KL of the noise and the Gaussian weight prior (reference settings 4.4).
+    and `weight_decay` scale the KL of the noise and the Gaussian weight prior (docs/reference.md 4.4).
     """
     features = states + len(angles) + controls
     network = MLP(hidden, states * (2 if heteroscedastic else 1), initialiser, activation)

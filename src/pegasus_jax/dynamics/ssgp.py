@@ -35,7 +35,7 @@ def ssgp(*, states: int, controls: int, angles: tuple[int, ...], points: int = 1
 
     Each output is a weighted sum of the cosines and sines of `points` phases; the weights have independent Gaussian
     priors of variance signal^2 / points, and frequencies, length scales, signal and noise maximise the evidence
-    (Lazaro-Gredilla et al. 2010, eq. 5 to 9). As in the authors' code (reference settings 6), the spectral points are
+    (Lazaro-Gredilla et al. 2010, eq. 5 to 9). As in the authors' code (docs/reference.md 6), the spectral points are
     standard normal before length scales divide them, and their mean square is penalised: in likelihood units 2 / points
     of a standard normal prior, which holds back the frequencies that overfit. A draw is a vector of weights.
     """

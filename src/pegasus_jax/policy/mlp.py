@@ -22,7 +22,7 @@ def mlp(
     input_scale: Array | float = 1.0,
     output_scale: float = 1.0,
 ) -> Policy:
-    """u = saturate(network(encode(x) * input_scale)); the noise is on each hidden layer's output (settings 5.1).
+    """u = saturate(network(encode(x) * input_scale)); noise is on each hidden layer's output (docs/reference.md 5.1).
 
     `output_scale` multiplies the last layer's initial weights: how far from the middle of the limits, and how near to
     saturation, a policy starts.

@@ -40,8 +40,8 @@ def film(run: Path, episodes: int, seed: int) -> Path:
     """Write RUN/play.mp4: `episodes` episodes that are not data, one after the other, in real time."""
     config, experiment, state = newest(run)
     task, mean = experiment.task, config.policy.execution == "mean"
-    if task.name not in tasks.TASKS:
-        raise RunError(f"{run} learned {task.name}; only the plants of pegasus_envs can be filmed")
+    if not hasattr(task.plant, "glide"):
+        raise RunError(f"{run} learned {task.name}; only plants in JAX can be filmed")
     perform = jax.jit(partial(performance, task=task, policy=experiment.policy, mean=mean))
     path, beside = run / "play.mp4", run / ".play.mp4"
     writer: Any = None

@@ -5,15 +5,21 @@ rate, to its aim by opposite offsets of the left and right flippers; pitch by co
 offsets (six); yaw by different amplitudes; six legs also push straight down or up by offsets of all of them.
 """
 
+from collections.abc import Sequence
+
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+
+from pegasus_envs.plant import Plant
+from pegasus_envs.swimmer import Swimming
 
 ROLL = {"knife_edge": np.pi / 2, "belly_up": np.pi, "depth_change": 0.0, "corkscrew": None}
 NAMES = ("thrust", "roll", "roll_rate", "pitch", "pitch_rate", "yaw", "yaw_rate", "depth", "steady", "lead", "heave")
 GAINS = {
     (2, "knife_edge"): [0.675, 0.401, 0.024, 0.43, 0.02, 0.173, 0.11, 0.424, 0.414, 0.465, 0.0],
-    (2, "belly_up"): [0.781, 0.34, 0.038, 0.348, 0.19, 0.182, 0.058, 0.572, 0.244, 0.164, 0.0],
+    (2, "belly_up"): [0.784, 0.356, 0.057, 0.924, -0.097, 0.186, 0.105, 0.965, 1.356, 0.293, 0.0],
     (2, "corkscrew"): [0.597, 0.208, 0.027, 0.632, 0.126, 0.09, 0.098, 0.456, 0.868, 1.021, 0.0],
     (2, "depth_change"): [0.784, 0.293, -0.071, 1.861, -0.395, 0.173, 0.324, 0.393, 0.443, 0.368, 0.0],
     (6, "knife_edge"): [0.699, 0.514, -0.015, 0.333, 0.024, 0.359, 0.046, 0.367, 0.673, 1.929, 0.0],
@@ -21,7 +27,7 @@ GAINS = {
     (6, "corkscrew"): [0.509, 0.106, 0.02, 0.427, 0.006, 0.327, 0.141, 0.677, 0.494, 0.217, 0.0],
     (6, "depth_change"): [0.785, 0.283, 0.049, 1.411, 0.078, 0.29, 0.234, 0.332, 0.494, 0.348, 1.855],
 }
-"""By a cross-entropy search: 32 candidates, 2 starts each, 9 generations (30 for the depth changes)"""
+"""by a cross-entropy search such as `benchmarks.gains`"""
 
 
 def feedback(gains: Array, x: Array, task: str, legs: int, depth: float, rate: float = -2.0 * np.pi / 3.0) -> Array:
@@ -49,6 +55,25 @@ def feedback(gains: Array, x: Array, task: str, legs: int, depth: float, rate: f
     along = jnp.array([-1.0, 0.0, 1.0, -1.0, 0.0, 1.0])
     across = jnp.array([1.0, 1.0, 1.0, -1.0, -1.0, -1.0])
     return jnp.concatenate([amplitude, pitch * along + roll * across - heave, jnp.array([0.0, np.pi, 0.0] * 2)])
+
+
+def episodes(plant: Plant, tasks: Sequence[str], which: Array, gains: Array, starts: Swimming) -> Array:
+    """Observations [N, H, D] of N episodes of 20 s at once: episode n does `tasks[which[n]]` with gains [n].
+
+    The motion is the same for all manoeuvres, so any swimmer with as many legs serves as the plant.
+    """
+    legs = 2 if len(plant.control_low) == 4 else 6
+    depths = {task: 2.0 if task == "depth_change" else 1.0 for task in tasks}
+    laws = [lambda g, x, task=task: feedback(g, x, task, legs, depths[task]) for task in tasks]
+
+    def episode(index: Array, gains: Array, state: Swimming) -> Array:
+        def advance(state: Swimming, _: None) -> tuple[Swimming, Array]:
+            state = plant.step(state, jax.lax.switch(index, laws, gains, plant.observe(state)))
+            return state, plant.observe(state)
+
+        return jax.lax.scan(advance, state, None, length=plant.horizon)[1]
+
+    return jax.vmap(episode)(which, gains, starts)
 
 
 def _in_body(angles: Array, vector: Array) -> Array:

@@ -1,0 +1,208 @@
+"""Any MJCF file as a plant: MJX's own step, contacts and constraints included; pure, so it can be vmapped."""
+
+# pyright: reportAttributeAccessIssue=false
+# (MuJoCo's bindings and MJX's data classes declare few of their names.)
+
+import hashlib
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax import Array
+
+from pegasus_envs.physics import mjx
+from pegasus_envs.plant import FRAME, draw_start
+
+_ENTRY = re.compile(r"(qpos|qvel)\.(\d+)")
+_UNITS = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
+
+
+class Moving(NamedTuple):
+    """What MuJoCo's next step depends on."""
+
+    qpos: Array
+    """[nq]"""
+    qvel: Array
+    """[nv]"""
+    act: Array
+    """[na] of actuators that have a state"""
+    warmstart: Array
+    """[nv] acceleration of the step before, from which the constraint solver starts"""
+    time: Array
+    """[] [s]"""
+
+
+class Mechanism(NamedTuple):
+    """A plant without a goal. D observed entries, U actuators; the functions are those of `plant.Plant`."""
+
+    reset: Callable[[Array], Moving]
+    step: Callable[[Moving, Array], Moving]
+    glide: Callable[[Moving, Array], Moving]
+    """(state, control [U]) -> the states [n, ...] on the way, about one each `FRAME` seconds, for films"""
+    observe: Callable[[Moving], Array]
+    place: Callable[[Array], Moving]
+    control_low: np.ndarray
+    control_high: np.ndarray
+    dt: float
+    start_mean: np.ndarray
+    start_std: np.ndarray
+    state_names: tuple[str, ...]
+    control_names: tuple[str, ...]
+    model: Any
+    qpos: Callable[[Moving], Array]
+
+
+def mechanism(
+    model: mujoco.MjModel,
+    dt: float,
+    *,
+    observe: Sequence[str] = (),
+    control_low: Sequence[float] = (),
+    control_high: Sequence[float] = (),
+    start_mean: Sequence[float] = (),
+    start_std: Sequence[float] = (0.1,),
+) -> Mechanism:
+    """The model's mechanism, driven through its actuators. Raises ValueError, in one line, for what cannot be.
+
+    Args:
+        model: as `read` returns it
+        dt: control period, a whole number of the model's time steps [s]
+        observe: entries such as `qpos.0` and `qvel.3`; all of them, positions first, when empty
+        control_low, control_high: limits, one an actuator; the file's `ctrlrange` when empty
+        start_mean: of the observed entries; the file's pose at rest when empty. What is not observed starts there.
+        start_std: of the observed entries; one number is for all of them
+    """
+    entries = _entries(model, observe)
+    low, high = _limits(model, control_low, control_high)
+    count = round(dt / model.opt.timestep)
+    if count < 1 or abs(count * model.opt.timestep - dt) > 1e-6 * dt:
+        near = max(count, 1) * model.opt.timestep
+        raise ValueError(f"dt={dt:g} is not a whole number of its time steps of {model.opt.timestep:g} s; try {near:g}")
+    rest = np.concatenate([model.qpos0, np.zeros(model.nv)])
+    mean = _filled("start_mean", start_mean, len(entries), rest[entries])
+    std = _filled("start_std", start_std, len(entries), np.zeros(len(entries)))
+    device, blank = _on_device(model)
+
+    def place(x: Array) -> Moving:
+        full = jnp.asarray(rest, x.dtype).at[entries].set(x)
+        zeros = jnp.zeros(model.nv, x.dtype)
+        return Moving(full[: model.nq], full[model.nq :], jnp.zeros(model.na, x.dtype), zeros, jnp.zeros((), x.dtype))
+
+    def advance(steps: int, state: Moving, control: Array) -> Moving:
+        data = blank.replace(qpos=state.qpos, qvel=state.qvel, act=state.act, time=state.time)
+        data = data.replace(qacc_warmstart=state.warmstart, ctrl=jnp.clip(control, low, high).astype(state.qpos.dtype))
+        data, _ = jax.lax.scan(lambda data, _: (mjx.step(device, data), None), data, None, length=steps)
+        return Moving(data.qpos, data.qvel, data.act, data.qacc_warmstart, data.time)
+
+    between = max(n for n in range(1, count + 1) if count % n == 0 and (n == 1 or n * model.opt.timestep <= FRAME))
+
+    def glide(state: Moving, control: Array) -> Moving:
+        def frame(state: Moving, _: None) -> tuple[Moving, Moving]:
+            following = advance(between, state, control)
+            return following, following
+
+        return jax.lax.scan(frame, state, None, length=count // between)[1]
+
+    made = Mechanism(
+        reset=lambda key: place(draw_start(key, mean, std)),
+        step=lambda state, control: advance(count, state, control),
+        glide=glide,
+        observe=lambda state: jnp.concatenate([state.qpos, state.qvel])[entries],
+        place=place,
+        control_low=low,
+        control_high=high,
+        dt=dt,
+        start_mean=mean,
+        start_std=std,
+        state_names=tuple(_state_names(model)[entry] for entry in entries),
+        control_names=tuple(model.actuator(i).name or f"u{i}" for i in range(model.nu)),
+        model=model,
+        qpos=lambda state: state.qpos,
+    )
+    try:
+        jax.eval_shape(made.step, jax.eval_shape(made.reset, jax.random.key(0)), jnp.zeros(model.nu))
+    except NotImplementedError as error:
+        raise ValueError(f"MJX cannot simulate it: {error}") from error
+    return made
+
+
+def read(path: Path) -> mujoco.MjModel:
+    """The model of an MJCF file. Raises ValueError, in one line, when MJX has no such model or gets it wrong."""
+    if not path.is_file():
+        raise ValueError("there is no such file")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ValueError(f"MuJoCo cannot read it: {' '.join(str(error).split())}") from error
+    if not model.nu:
+        raise ValueError("it has no actuators, so there is nothing to control")
+    if np.any(model.geom_fluid[:, 0] > 0) and (model.opt.density > 0 or model.opt.viscosity > 0):
+        raise ValueError("MJX ignores fluidshape='ellipsoid'; leave it out for the drag on inertia boxes")
+    if model.nplugin:
+        raise ValueError("MJX has no plugins")
+    return model
+
+
+def digest(model: mujoco.MjModel) -> str:
+    """SHA-256 of a compiled model, whatever files it was made of."""
+    content = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return hashlib.sha256(content.tobytes()).hexdigest()
+
+
+def _on_device(model: mujoco.MjModel) -> tuple[Any, Any]:
+    try:
+        with jax.ensure_compile_time_eval():  # so that a plant may be built inside jit
+            return mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
+    except NotImplementedError as error:
+        raise ValueError(f"MJX cannot simulate it: {error}") from error
+
+
+def _entries(model: mujoco.MjModel, observe: Sequence[str]) -> np.ndarray:
+    """Indices into positions followed by velocities."""
+    sizes, found = {"qpos": model.nq, "qvel": model.nv}, []
+    for word in observe:
+        match = _ENTRY.fullmatch(word)
+        if not match or int(match[2]) >= sizes[match[1]]:
+            choices = f"qpos.0 to qpos.{model.nq - 1} or qvel.0 to qvel.{model.nv - 1}"
+            raise ValueError(f"observe={word} is not an entry of its state; choose from {choices}")
+        found.append(int(match[2]) + (model.nq if match[1] == "qvel" else 0))
+    return np.array(found, int) if found else np.arange(model.nq + model.nv)
+
+
+def _limits(model: mujoco.MjModel, low: Sequence[float], high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest controls [U], and where neither the user nor the file names them, a refusal."""
+    ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, [-np.inf, np.inf])
+    lows = _filled("control_low", low, model.nu, ranges[:, 0])
+    highs = _filled("control_high", high, model.nu, ranges[:, 1])
+    for i, (least, greatest) in enumerate(zip(lows, highs, strict=True)):
+        if not (np.isfinite(least) and np.isfinite(greatest)):
+            name = model.actuator(i).name or i
+            raise ValueError(f"actuator {name} has no ctrlrange; give control_low= and control_high=, one an actuator")
+        if not least < greatest:
+            raise ValueError(f"control_low={least:g} must be less than control_high={greatest:g}")
+    return lows, highs
+
+
+def _filled(name: str, given: Sequence[float], size: int, default: np.ndarray) -> np.ndarray:
+    """The numbers given, one for all or one each, or the default."""
+    if len(given) not in (0, 1, size):
+        raise ValueError(f"{name} has {len(given)} entries; expected {size}, or one for all")
+    return np.broadcast_to(np.asarray(given, float), (size,)).copy() if len(given) else np.asarray(default, float)
+
+
+def _state_names(model: mujoco.MjModel) -> list[str]:
+    """Names of positions, then velocities: a joint's where it is a hinge or a slide, else the entry's."""
+    positions, rates = [f"qpos.{i}" for i in range(model.nq)], [f"qvel.{i}" for i in range(model.nv)]
+    for i in range(model.njnt):
+        joint = model.joint(i)
+        if unit := _UNITS.get(int(model.jnt_type[i])):
+            name = joint.name or f"joint {i}"
+            positions[model.jnt_qposadr[i]] = f"{name} [{unit}]"
+            rates[model.jnt_dofadr[i]] = f"{name}' [{unit}/s]"
+    return positions + rates
