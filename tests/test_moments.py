@@ -55,6 +55,31 @@ def factor_and_gradient():
     return jax.jit(lambda c: (cholesky(c), jax.grad(lambda c: jnp.sum(jnp.sin(cholesky(c))))(c)))
 
 
+def eliminated(cov):
+    """The factor by elimination, whose derivative jax takes step by step."""
+    rest, columns = cov, []
+    for j in range(cov.shape[0]):
+        column = rest[:, j] / jnp.sqrt(jnp.maximum(rest[j, j], 1e-7 * cov[j, j] + jnp.finfo(cov.dtype).tiny ** 0.5))
+        columns.append(jnp.where(jnp.arange(cov.shape[0]) >= j, column, 0))
+        rest = rest - jnp.outer(columns[-1], columns[-1])
+    return jnp.stack(columns, 1)
+
+
+@given(seed=seeds)
+def test_a_floored_pivot_counts_as_a_constant_in_the_gradient(seed):
+    """The last of three dimensions is a combination of the others, to 1e-6 of its size: particles on a plane."""
+    noise = np.random.default_rng(seed)
+    points = noise.normal(size=(3, 3)) * np.array([[1.0], [1.0], [1e-6]])
+    root = np.array([[1, 0, 0], [0.5, 1, 0], [-0.3, 0.7, 1]]) @ points
+    with jax.enable_x64(True):
+        weight = jnp.asarray(noise.normal(size=(3, 3)))
+        ours, theirs = (
+            jax.grad(lambda c, f=f: jnp.sum(weight * f((c + c.T) / 2)))(jnp.asarray(root @ root.T))
+            for f in (cholesky, eliminated)
+        )
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-5 * np.abs(theirs).max())
+
+
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_a_degenerate_covariance_gives_finite_factor_and_gradient(name, factor_and_gradient):
     cov = jnp.asarray(DEGENERATE[name], jnp.float32)

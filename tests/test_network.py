@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.network import INITIALISERS, MLP
+from pegasus_jax.network import ACTIVATIONS, INITIALISERS, MLP
 
 
 def forward(params, x, masks):
@@ -52,3 +52,13 @@ def test_initial_weights(name):
     biases = np.concatenate([params[f"layer_{i}"]["bias"] for i in range(2)])
     assert np.all(np.abs(biases) <= 0.01)
     assert len(np.unique(biases)) == 100
+
+
+@pytest.mark.parametrize("name", ACTIVATIONS)
+def test_activations_and_their_slopes_are_the_librarys(name):
+    """relu, silu and tanh under the same names; forward, backward, and where exp overflows float32."""
+    x = jnp.asarray([-100.0, -5.0, -0.1, 0.3, 4.0, 100.0])
+    ours, theirs = (jax.vmap(jax.value_and_grad(f))(x) for f in (ACTIVATIONS[name], getattr(jax.nn, name)))
+    np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-7)
+    tangents = [jax.jvp(f, (x,), (x,))[1] for f in (ACTIVATIONS[name], getattr(jax.nn, name))]
+    np.testing.assert_allclose(*tangents, rtol=1e-6, atol=1e-6)

@@ -250,7 +250,8 @@ class Search:
     balanced: bool = setting(False, "make the drawn noise exactly zero mean, unit covariance over the particles")
     aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
     discount: float = setting(1.0, "weight of a later step against the one before")
-    cost: str = setting("particles", "of each of the particles, or the expected one of the matched Gaussian: matched")
+    cost: str = setting("matched", "expected one of the matched Gaussian, or of each of the particles: particles")
+    widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
@@ -274,6 +275,7 @@ class Search:
         _within("search.risk", self.risk, 0, 1, open_low=True)
         if self.risk < 1 and self.cost == "matched":
             raise SettingError(f"search.risk={self.risk:g} needs the cost of each particle: search.cost=particles")
+        _within("search.widen", self.widen, 1)
         if self.truncate is not None:
             _within("search.truncate", self.truncate, 1)
         for name in ("policy_noise", "state_noise", "cost_noise"):
@@ -381,7 +383,7 @@ POLICIES: dict[str, dict[str, Any]] = {
     "linear": {"policy": Linear()},
 }
 ALGORITHMS: dict[str, dict[str, Any]] = {
-    "pegasus": {},  # the defaults: what learned best (docs/decisions/0001)
+    "pegasus": {},  # the defaults: what learned best (docs/decisions)
     "paper": {  # Alg. 3 as printed: all draws but the start particles held for a whole search
         "model.activation": "relu",
         "model.kl_weight": 1.0,
@@ -391,6 +393,8 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
         "search.period.policy": 0,
         "search.period.sensor": 0,
         "search.period.match": 0,
+        "search.cost": "particles",
+        "search.widen": 1.0,
         "search.reset": False,
         "search.restart": False,
     },
@@ -400,6 +404,8 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
         "fit.learning_rate": 1e-4,
         "search.restart": False,
         "search.particles": 10,
+        "search.cost": "particles",
+        "search.widen": 1.0,
         "search.clip": None,
         "search.period.start": 1,
         "search.period.dynamics": 1,

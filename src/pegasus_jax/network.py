@@ -13,7 +13,21 @@ INITIALISERS: dict[str, Callable] = {
 }
 
 
-ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "silu": nn.silu, "tanh": nn.tanh}
+@jax.custom_jvp
+def silu(x: Array) -> Array:
+    """x sigmoid(x). Differentiated, it leaves one array for the way back, its slope, where jax.nn.silu leaves three."""
+    return nn.silu(x)
+
+
+@silu.defjvp
+def _silu_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array, Array]:
+    (x,), (dx,) = primals, tangents
+    s = nn.sigmoid(x)
+    y = x * s
+    return y, (s + y * (1 - s)) * dx
+
+
+ACTIVATIONS: dict[str, Callable[[Array], Array]] = {"relu": nn.relu, "silu": silu, "tanh": nn.tanh}
 
 
 def _small_uniform(key: jax.Array, shape: Sequence[int], dtype: object = None) -> Array:

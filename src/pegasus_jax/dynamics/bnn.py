@@ -21,9 +21,11 @@ class Scaling(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """A fitted network."""
+    """A fitted network whose outer layers contain the scaling, so that a rollout does not repeat it at each step."""
 
-    params: Params
+    network: Params  # centred inputs (white ones, where they carry noise) -> change of state [D], raw std [D]
+    raw_std: Array | None  # [D], of a network that does not predict it
+    noise: Params
     scaling: Scaling
 
 
@@ -80,15 +82,29 @@ def bnn(
             data.size,
         )
 
-    def masks_of(params: Params, noise: tuple) -> list[Array | None]:
-        return [k.mask(p, z) if k else None for k, p, z in zip(kinds, params["noise"], noise, strict=True)]
+    def masks_of(params: tuple, noise: tuple) -> list[Array | None]:
+        return [k.mask(p, z) if k else None for k, p, z in zip(kinds, params, noise, strict=True)]
+
+    def believe(params: Params, scaling: Scaling) -> Belief:
+        layers = dict(params["network"]["params"])
+        if not input_dropout:
+            layers["layer_0"] = {**layers["layer_0"], "kernel": scaling.inputs.inverse.T @ layers["layer_0"]["kernel"]}
+        last, targets = layers[f"layer_{len(hidden)}"], scaling.targets
+        kernel, bias = last["kernel"], last["bias"]
+        layers[f"layer_{len(hidden)}"] = {
+            "kernel": jnp.concatenate([kernel[:, :states] @ targets.root.T, kernel[:, states:]], 1),
+            "bias": jnp.concatenate([unwhiten(targets, bias[:states]), bias[states:]]),
+        }
+        return Belief({"params": layers}, params.get("raw_std"), params["noise"], scaling)
 
     def predict(belief: Belief, masks: list[Array | None], x: Array, u: Array) -> Prediction:
-        params, scaling = belief
-        out: Any = network.apply(params["network"], whiten(scaling.inputs, inputs_of(x, u)), masks)
-        raw = out[..., states:] if heteroscedastic else jnp.broadcast_to(params["raw_std"], out.shape)
-        scale = jnp.diagonal(scaling.targets.root)
-        return Prediction(unwhiten(scaling.targets, out[..., :states]), head(raw) * scale)
+        inputs, scaling = inputs_of(x, u), belief.scaling
+        inputs = whiten(scaling.inputs, inputs) if input_dropout else inputs - scaling.inputs.mean
+        out: Any = network.apply(belief.network, inputs, masks)
+        mean, raw = out[..., :states], out[..., states:]
+        if belief.raw_std is not None:
+            raw = jnp.broadcast_to(belief.raw_std, mean.shape)
+        return Prediction(mean, head(raw) * jnp.diagonal(scaling.targets.root))
 
     def loss(params: Params, key: Key, batch: Batch, scaling: Scaling) -> Array:
         """-log likelihood a row, in raw units, + (KL of the noise + weight prior) / N: eq. 2 divided by N."""
@@ -98,7 +114,7 @@ def bnn(
         noise = tuple(
             k.sample(kk, rows * w).reshape(rows, w) if k else None for k, kk, w in zip(kinds, keys, widths, strict=True)
         )
-        mean, std = predict(Belief(params, scaling), masks_of(params, noise), batch.x, batch.u)
+        mean, std = predict(believe(params, scaling), masks_of(params["noise"], noise), batch.x, batch.u)
         misfit = jnp.sum(0.5 * ((batch.y - mean) / std) ** 2 + jnp.log(std), -1)
         return jnp.mean(misfit) + penalty(params) / scaling.size
 
@@ -115,13 +131,13 @@ def bnn(
         """The masks of one particle, w^(k) = g_2(w, z_w^(k)) (Alg. 3 line 9): all that differs between particles."""
         keys = jax.random.split(key, len(kinds))
         noise = tuple(k.sample(kk, w) if k else None for k, kk, w in zip(kinds, keys, widths, strict=True))
-        return masks_of(belief.params, noise)
+        return masks_of(belief.noise, noise)
 
     return Dynamics(
         init=init,
         prepare=prepare,
         loss=loss,
-        condition=lambda params, data: Belief(params, prepare(data)),
+        condition=lambda params, data: believe(params, prepare(data)),
         sample=sample,
         apply=predict,
     )
