@@ -20,8 +20,8 @@ from benchmarks.study import RESULTS
 from benchmarks.timing import compiled, in_turn, matmul
 from pegasus_jax import settings
 from pegasus_jax.build import build, set_precision
-from pegasus_jax.config import MODELS, POLICIES
 from pegasus_jax.record import about
+from pegasus_jax.variants import MODELS, POLICIES
 
 STEPS, PRODUCTS = 4, 500  # in one call
 PILCO = [

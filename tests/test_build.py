@@ -10,7 +10,7 @@ import pytest
 
 from pegasus_jax import config, cost, dataset, moments, scenarios, settings, types
 from pegasus_jax.build import AGGREGATES, EXPLORATIONS, build, compose, dropout_of, search_of, start
-from pegasus_jax.config import ALGORITHMS, DROPOUTS, MODELS, POLICIES, Config, Period, SettingError
+from pegasus_jax.config import DROPOUTS, Config, Period, SettingError
 from pegasus_jax.dynamics.bnn import HEADS
 from pegasus_jax.dynamics.gp import gp
 from pegasus_jax.dynamics.ssgp import ssgp
@@ -19,6 +19,7 @@ from pegasus_jax.network import INITIALISERS
 from pegasus_jax.policy.squash import SQUASHES
 from pegasus_jax.search import objective
 from pegasus_jax.trial import SEARCH, trial_key
+from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
 from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, same, tiny
 
 pytestmark = pytest.mark.usefixtures("quick_compile")

@@ -10,10 +10,10 @@ import pytest
 
 from pegasus_jax import settings
 from pegasus_jax.build import compose, dynamics_of
-from pegasus_jax.config import ALGORITHMS, MODELS, POLICIES
 from pegasus_jax.cost import expected_saturating, saturating, widened
 from pegasus_jax.tasks import make
 from pegasus_jax.types import Trajectory
+from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
 from probes import same, unchecked
 
 pytestmark = pytest.mark.usefixtures("quick_compile")

@@ -10,23 +10,9 @@ from hypothesis import strategies as st
 
 from pegasus_jax import config, settings
 from pegasus_jax.build import compose
-from pegasus_jax.config import (
-    ALGORITHMS,
-    BNN,
-    KINDS,
-    MLP,
-    MODELS,
-    POLICIES,
-    RBF,
-    Analytic,
-    Config,
-    Explore,
-    Fit,
-    Period,
-    Search,
-    SettingError,
-)
+from pegasus_jax.config import BNN, MLP, RBF, Analytic, Config, Explore, Fit, Period, Search, SettingError
 from pegasus_jax.tasks import TASKS
+from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 from probes import cart
 
 
