@@ -10,11 +10,11 @@ STAMP := $(VENV)/.installed
 CODE  := $(wildcard src envs tests benchmarks)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test check format bench figures docs lock clean
+.PHONY: help setup train test check format bench bench-compare figures docs lock clean
 .DELETE_ON_ERROR:
 
 help: ## list the targets
-	@awk -F ':.*## ' '/^[a-z]+:.*## / {printf "  make %-9s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
+	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-14s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 	@echo
 	@echo '  PYTHON=python3.12 chooses the interpreter of a new .venv; ARGS="..." goes to the program that the target runs.'
 
@@ -38,6 +38,10 @@ format: $(STAMP) ## format the code and fix what lint can fix
 
 bench: $(STAMP) ## measure speed
 	$(BIN)/python -m benchmarks.suite $(ARGS)
+
+bench-compare: $(STAMP) ## measure speed again and fail if it is below .77 of the stored run's; quicker: ARGS="quick=true"
+	$(BIN)/python -m benchmarks.suite out=$(VENV)/speed.json $(ARGS)
+	$(BIN)/python -m benchmarks.compare $(VENV)/speed.json
 
 figures: $(STAMP) ## run one of the paper's experiments: make figures FIGURE=crn
 	$(BIN)/python -m benchmarks.figures $(FIGURE) $(ARGS)

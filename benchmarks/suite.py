@@ -1,17 +1,17 @@
-"""Speed here: trace, compile and run time of each part of a trial, beside a plain matmul in the same process.
+"""Speed here: a search step at the paper's sizes, and every other part of a trial, beside plain matrix products.
 
-    python -m benchmarks.suite [repeats=7] [setting=value ...]
+    python -m benchmarks.suite [quick=true] [repeats=7] [out=FILE] [setting=value ...]
 
-Prints a table and writes benchmarks/results/speed.json. Compare ratios within one run: machines are noisy.
+Prints one table and writes it, with versions and machine, to benchmarks/results/speed.json. Compare ratios within one
+run: machines are noisy. `of products` is the time of a search step over that of its own matrix products, each timed
+alone in the same process with the same shapes. On a process pinned to one CPU (taskset -c 0) times are CPU time.
 """
 
-import itertools
 import json
+import os
 import resource
 import shlex
-import statistics
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -19,107 +19,158 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
+from benchmarks.timing import clock, compiled, in_turn, matmul, own_products, summary
+from benchmarks.workloads import SIZES, Workload, flop, workload
 from pegasus_jax import settings
 from pegasus_jax.build import build
 from pegasus_jax.config import Config
 from pegasus_jax.record import about
 
 RESULTS = Path(__file__).parent / "results"
-MATMULS = 1000  # a loop long enough that starting it does not count
+STEPS, FIT_STEPS, PRODUCTS = 10, 100, 500  # steps, and products, in one timed run
+Row = dict[str, float]
+Words = dict[str, str]
+
+# What a gradient costs as one thing grows from the cart-pole's: the name, and the values as settings (or the horizon).
+GROWTH = {
+    "K": ("search.particles", ("30", "100", "300", "1000")),
+    "H": ("horizon", ("12", "25", "50")),
+    "width": ("model.hidden", ("[50,50]", "[200,200]", "[400,400]")),
+}
 
 
-def measure(function: Callable[..., Any], *arguments: Any, repeats: int, per: int = 1) -> dict[str, float]:
-    """Seconds to trace and compile, and milliseconds to run (each of `per` steps inside one call)."""
-    began = time.perf_counter()
-    lowered = jax.jit(function).lower(*arguments)
-    traced = time.perf_counter()
-    compiled = lowered.compile()
-    ready = time.perf_counter()
-    jax.block_until_ready(compiled(*arguments))
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(compiled(*arguments))
-        times.append((time.perf_counter() - start) / per * 1e3)
+def measure(function: Callable[..., Any], *arguments: Any, repeats: int, per: int = 1) -> Row:
+    """Trace, compile and run time of a function of `per` steps, in turn with matrix products."""
+    program, row = compiled(function, *arguments)
+    times = in_turn({"program": program, "matmul": matmul(PRODUCTS)}, repeats)
+    row |= summary(times["program"], per)
+    row["of_matmul"] = row["min_ms"] / summary(times["matmul"], PRODUCTS)["min_ms"]
+    return row
+
+
+def search_step(work: Workload, repeats: int) -> Row:
+    """A search step, the least it could cost, and how near its gradient is to the one in float64."""
+    row = measure(partial(work.experiment.search, steps=STEPS), work.state, jnp.int32(1), repeats=repeats, per=STEPS)
+    row["gflop"] = flop(work) / 1e9
+    row["of_products"] = row["min_ms"] / own_products(work, repeats)
+    return row | quality(work)
+
+
+def quality(work: Workload) -> Row:
+    """The objective, its error and its gradient's, relative to float64's and to the gradient's norm."""
+    value = jax.value_and_grad(work.objective)
+    given = (work.state.policy.params, work.belief, work.scenarios)
+    ours, gradient = jax.jit(value)(*given)
+    with jax.enable_x64(True):
+        exact, exact_gradient = jax.jit(value)(*jax.tree.map(widened, given))
+    ours_flat, exact_flat = (
+        np.concatenate([np.ravel(np.asarray(leaf)) for leaf in jax.tree.leaves(tree)])
+        for tree in (gradient, exact_gradient)
+    )
     return {
-        "trace_s": traced - began,
-        "compile_s": ready - traced,
-        "min_ms": min(times),
-        "median_ms": statistics.median(times),
+        "objective": float(ours),
+        "objective_error": abs(float(ours) - float(exact)) / abs(float(exact)),
+        "gradient_error": float(np.linalg.norm(ours_flat - exact_flat) / np.linalg.norm(exact_flat)),
     }
 
 
-def matmul(rows: int = 100, width: int = 200) -> tuple[Callable[..., Any], tuple[Any, Any], float]:
-    """A loop of (rows x width)(width x width) products, its arguments, and the FLOP of one."""
-    x, w = jnp.ones((rows, width)), jnp.eye(width) * 0.999
-
-    def loop(x: Any, w: Any) -> Any:
-        return jax.lax.fori_loop(0, MATMULS, lambda _, h: h @ w, x)
-
-    return loop, (x, w), 2.0 * rows * width * width
+def widened(leaf: Any) -> Any:
+    """The array in float64, if it is one of floats."""
+    return jnp.asarray(leaf, jnp.float64) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf
 
 
-def search_flop(config: Config, states: int, features: int, controls: int, horizon: int) -> float:
-    """Multiply-adds that a search step cannot avoid: both networks forward and back to their inputs, and the weight
-    gradients of the policy."""
-
-    def weights(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
-        sizes = (inputs, *hidden, outputs)
-        return sum(a * b for a, b in itertools.pairwise(sizes))
-
-    model = weights(features + controls, config.model.hidden, states * (1 + config.model.heteroscedastic))
-    policy = weights(features, config.policy.hidden, controls)
-    return 2.0 * config.search.particles * horizon * (2 * model + 3 * policy)
-
-
-def suite(config: Config, repeats: int) -> dict[str, dict[str, float]]:
-    """Every part of one trial, measured on a state that has one episode."""
+def trial_parts(config: Config, repeats: int) -> dict[str, Row]:
+    """What a trial has besides its search, on the task's own plant; and a whole trial, of few updates."""
     experiment = build(config)
-    task = experiment.task
     state = jax.jit(experiment.init)(jax.random.key(config.seed))
-    state = jax.jit(experiment.absorb)(state, jax.jit(experiment.collect)(state))
-    loop, arguments, flop = matmul()
-    rows = {"matmul 100x200x200": measure(loop, *arguments, repeats=repeats, per=MATMULS)}
-    peak = flop / rows["matmul 100x200x200"]["min_ms"]
-    steps = 20
-    search = partial(experiment.search, steps=steps)
-    features = len(task.state_names) + len(task.angles)
-    rows["search step"] = measure(search, state, jnp.int32(0), repeats=repeats, per=steps)
-    needed = search_flop(config, len(task.state_names), features, len(task.control_names), task.horizon)
-    rows["search step"]["gflop"] = needed / 1e9
-    rows["search step"]["of_matmul_peak"] = needed / rows["search step"]["min_ms"] / peak
-    fit = partial(experiment.fit, steps=200)
-    rows["fit step"] = measure(fit, state, repeats=repeats, per=200)
+    began = clock()
+    collect, absorb = jax.jit(experiment.collect), jax.jit(experiment.absorb)
+    state = absorb(state, collect(state))
+    fit, search = (jax.jit(partial(part, steps=1)) for part in (experiment.fit, experiment.search))
+    jax.block_until_ready(search(fit(state)[0])[0])
+    first = clock() - began
+
+    def trial(state: Any) -> Any:
+        state = experiment.absorb(state, experiment.collect(state))
+        state, _ = experiment.fit(state, steps=FIT_STEPS)
+        return experiment.search(state, steps=STEPS)[0]
+
     follow = (jax.random.key(0), state.policy.params, jnp.asarray(False))
-    rows["plant episode"] = measure(experiment.episode, *follow, repeats=repeats)
-    rows["imagine"] = measure(experiment.imagine, state, repeats=repeats)
-    for row in rows.values():
-        row["of_matmul"] = row["min_ms"] / rows["matmul 100x200x200"]["min_ms"]
+    return {
+        "first result": {"compile_s": first},
+        "fit step": measure(partial(experiment.fit, steps=FIT_STEPS), state, repeats=repeats, per=FIT_STEPS),
+        "plant episode": measure(experiment.episode, *follow, repeats=repeats),
+        "imagine": measure(experiment.imagine, state, repeats=repeats),
+        f"trial of {FIT_STEPS} + {STEPS} steps": measure(trial, state, repeats=repeats),
+    }
+
+
+def growth(words: Words, repeats: int) -> dict[str, Row]:
+    """The gradient's cost against K, H, width and seeds; the fit's against the size of the data set."""
+    rows = {}
+    for name, (setting, values) in GROWTH.items():
+        for value in values:
+            work = workload(words, int(value)) if name == "H" else workload({**words, setting: value})
+            rows[f"gradient, {name}={value}"] = gradient(work, repeats, 1)
+    work = workload(words)
+    for seeds in (1, 2, 5, 10):
+        rows[f"gradient, seeds={seeds}"] = gradient(work, repeats, seeds)
+    for trials in (15, 60, 240):
+        work = workload({**words, "trials": str(trials)})
+        fit = partial(work.experiment.fit, steps=FIT_STEPS)
+        rows[f"fit step, N={len(work.state.data.x)}"] = measure(fit, work.state, repeats=repeats, per=FIT_STEPS)
     return rows
 
 
-def table(rows: dict[str, dict[str, float]]) -> str:
+def gradient(work: Workload, repeats: int, seeds: int) -> Row:
+    """The objective and its gradient for policies of several seeds at once."""
+    params = jax.tree.map(lambda leaf: jnp.stack([leaf] * seeds), work.state.policy.params)
+    value = jax.vmap(jax.value_and_grad(work.objective), (0, None, None))
+    return measure(value, params, work.belief, work.scenarios, repeats=repeats)
+
+
+def suite(words: Words, repeats: int, quick: bool) -> dict[str, Row]:
+    """Every row. `quick`: the cart-pole's alone, and nothing that grows."""
+    rows = {}
+    for name in list(SIZES)[: 1 if quick else None]:
+        for match in ("true", "false"):
+            suffix = "" if match == "true" else ", no matching"
+            work = workload({**SIZES[name], "search.match": match, **words})
+            rows[f"search step, {name}{suffix}"] = search_step(work, repeats)
+    cartpole = {**SIZES["cart-pole"], **words}
+    rows |= trial_parts(settings.parse(cartpole), repeats)
+    return rows if quick else rows | growth(cartpole, repeats)
+
+
+COLUMNS = (
+    *("trace_s", "compile_s", "min_ms", "median_ms", "of_matmul", "of_products"),
+    *("gflop", "memory_mb", "objective_error", "gradient_error"),
+)
+
+
+def table(rows: dict[str, Row]) -> str:
     """The rows as text."""
-    columns = ("trace_s", "compile_s", "min_ms", "median_ms", "of_matmul", "of_matmul_peak")
-    lines = [f"{'':20s}" + "".join(f"{name:>16s}" for name in columns)]
+    lines = [f"{'':36s}" + "".join(f"{name:>16s}" for name in COLUMNS)]
     for name, row in rows.items():
-        cells = "".join(f"{row[c]:16.3f}" if c in row else f"{'':16s}" for c in columns)
-        lines.append(f"{name:20s}{cells}")
+        lines.append(f"{name:36s}" + "".join(f"{row[c]:16.3g}" if c in row else f"{'':16s}" for c in COLUMNS))
     return "\n".join(lines)
 
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, dotted = settings.split(words, ("repeats",))
-    rows = suite(settings.parse(dotted), int(options.get("repeats", "7")))
-    peak_memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    options, dotted = settings.split(words, ("repeats", "quick", "out"))
+    rows = suite(dotted, int(options.get("repeats", "7")), options.get("quick") == "true")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     print(table(rows))
-    print(f"peak memory {peak_memory / 1e9:.2f} GB")
-    RESULTS.mkdir(exist_ok=True)
+    print(f"peak memory of the process {peak / 1e9:.2f} GB")
+    machine = {"cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()}
     command = shlex.join(["python", "-m", "benchmarks.suite", *words])
-    result = {"rows": rows, "peak_memory_bytes": peak_memory, "about": about(command)}
-    (RESULTS / "speed.json").write_text(json.dumps(result, indent=1) + "\n")
+    result = {"rows": rows, "peak_memory_bytes": peak, "machine": machine, "about": about(command)}
+    out = Path(options.get("out", RESULTS / "speed.json"))
+    out.parent.mkdir(exist_ok=True)
+    out.write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":

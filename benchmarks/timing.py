@@ -21,7 +21,7 @@ def clock() -> float:
 
 
 def compiled(function: Callable[..., Any], *arguments: Any) -> tuple[Program, dict[str, float]]:
-    """The function compiled for the arguments, as a program without any; seconds to trace and compile, bytes it needs."""
+    """The function compiled for the arguments, as a program without any; seconds to trace and compile, and memory."""
     began = clock()
     lowered = jax.jit(function).lower(*arguments)
     traced = clock()

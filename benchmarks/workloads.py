@@ -6,6 +6,7 @@ objective and its gradient say something.
 
 from collections.abc import Callable
 from functools import partial
+from itertools import pairwise
 from typing import NamedTuple
 
 import jax
@@ -97,13 +98,13 @@ def wandering(task: Task, seed: int) -> Trajectory:
 def layers(inputs: int, hidden: tuple[int, ...], outputs: int) -> list[tuple[int, int]]:
     """(inputs, outputs) of every layer of a network."""
     sizes = (inputs, *hidden, outputs)
-    return list(zip(sizes, sizes[1:], strict=False))
+    return list(pairwise(sizes))
 
 
 def products(work: Workload) -> dict[tuple[str, int, int, int], int]:
     """The matrix products of one search step and how often each is needed: (kind, K, inputs, outputs) -> times.
 
-    Of both networks the products forward and back to their inputs, of the policy those that give its weights' gradients.
+    Of both networks the products forward and back to their inputs; of the policy those that give its weight gradients.
     """
     config, task = work.config, work.task
     states, controls = len(task.state_names), len(task.control_names)

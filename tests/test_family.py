@@ -1,7 +1,7 @@
 """Every model with every policy, matched or not, and analytically where there are moments: one loop serves them all."""
 
 import itertools
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pegasus_jax import settings
-from pegasus_jax.build import compose
+from pegasus_jax.build import compose, dynamics_of
 from pegasus_jax.config import ALGORITHMS, MODELS, POLICIES
-from pegasus_jax.cost import expected_saturating, saturating
+from pegasus_jax.cost import expected_saturating, saturating, widened
 from pegasus_jax.tasks import make
 from pegasus_jax.types import Trajectory
 from probes import same, unchecked
@@ -52,18 +52,28 @@ class Counted:
 
 
 def composed(model, policy, how):
-    """The member of the family on a cart-pole, and how often its costs were traced."""
+    """The member of the family on a cart-pole, and how often its model was traced."""
     chosen = {"model": model, "policy": policy, **({"algorithm": "pilco"} if how == "analytic" else {})}
     there = settings.leaves(settings.parse(chosen))
     small = {key: value for key, value in SMALL.items() if key in there}
     if model != "ensemble":
         small.pop("model.members", None)
-    if how != "analytic":
-        small["search.match"] = str(how == "matched").lower()
-    task = make("cartpole")._replace(horizon=HORIZON, start_mean=UPRIGHT, start_std=np.full(4, 0.02))
-    cost = Counted(saturating(task.plant.error, WIDTH))
-    expected = Counted(expected_saturating(task.plant.error, WIDTH, task.angles))
-    return compose(settings.parse(chosen | small), task._replace(cost=cost, expected_cost=expected)), cost, expected
+    if how == "kept":
+        small |= {"search.match": "false", "search.cost": "particles", "search.widen": "1"}
+    config, task = settings.parse(chosen | small), make("cartpole")
+    error, angles = task.plant.error, task.angles
+    task = task._replace(
+        horizon=HORIZON,
+        start_mean=UPRIGHT,
+        start_std=np.full(4, 0.02),
+        cost=saturating(error, WIDTH),
+        expected_cost=expected_saturating(error, WIDTH, angles),
+        widened=partial(widened, error, WIDTH, angles),
+    )
+    dynamics = dynamics_of(config.model, task)
+    apply, moments = Counted(dynamics.apply), dynamics.moments and Counted(dynamics.moments)
+    traces = lambda: apply.count + (moments.count if moments else 0)  # noqa: E731
+    return compose(config, task, dynamics=dynamics._replace(apply=apply, moments=moments)), traces
 
 
 def episodes(trial):
@@ -76,7 +86,7 @@ def episodes(trial):
 @cache
 def fitted(model):
     """A model's fit, compiled once for all policies: (state, episodes) -> state and report."""
-    exp, _, _ = composed(model, "mlp", "matched")
+    exp, _ = composed(model, "mlp", "matched")
     return unchecked(jax.jit(jax.vmap(lambda state, episode: exp.fit(exp.absorb(state, episode)))))
 
 
@@ -87,7 +97,7 @@ def described(tree):
 @pytest.mark.parametrize(("model", "policy", "how"), FAMILY, ids=["-".join(member) for member in FAMILY])
 def test_member_of_the_family(model, policy, how):
     """Three trials of two seeds: shapes and types kept, all finite, no update skipped, one trace, and repeatable."""
-    exp, cost, expected = composed(model, policy, how)
+    exp, traced = composed(model, policy, how)
     search = unchecked(jax.jit(jax.vmap(exp.search)))
     state = jax.jit(jax.vmap(exp.init))(jax.vmap(jax.random.key)(jnp.arange(SEEDS)))
     traces = []
@@ -96,7 +106,7 @@ def test_member_of_the_family(model, policy, how):
         learned, report = fitted(model)(state._replace(policy=None), episodes(trial))
         before = learned._replace(policy=state.policy)
         after, searched = search(before)
-        traces.append(cost.count + expected.count)
+        traces.append(traced())
         assert described(after) == described(before) == described(state)
         for leaf in jax.tree.leaves((after.model.params, after.policy.params, report, searched)):
             assert np.all(np.isfinite(leaf))

@@ -44,7 +44,8 @@ def blocks(
 
     def normal(key: Key, _: Params) -> Array:
         states = jax.eval_shape(start, key).shape[0]
-        z = jax.random.normal(key, (horizon, particles, states))
+        # Drawn as one long row: the same numbers, by loops that need not stop every few dimensions.
+        z = jax.random.normal(key, (horizon * particles * states,)).reshape(horizon, particles, states)
         return spread(standardise(z) if balanced else z, 1)
 
     return Blocks(

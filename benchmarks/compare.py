@@ -1,0 +1,39 @@
+"""Hold one run of the suite against a stored one, by ratios to the matrix products of the same process.
+
+    python -m benchmarks.compare NEW.json [STORED.json]
+
+Fails when a row that both have has become slower by more than LIMIT, or when they have none in common. A quick run may
+be held against a full one. Both must have been made with as many CPUs.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+STORED = Path(__file__).parent / "results" / "speed.json"
+LIMIT = 1.3
+
+Rows = dict[str, dict[str, Any]]
+
+
+def ratios(new: Rows, stored: Rows) -> dict[str, float]:
+    """How many times slower each row that both runs have has become, machine speed taken out."""
+    shared = [name for name in stored if "of_matmul" in stored[name] and "of_matmul" in new.get(name, {})]
+    return {name: new[name]["of_matmul"] / stored[name]["of_matmul"] for name in shared}
+
+
+def main(words: list[str]) -> int:
+    """The command line of this module; the exit code."""
+    new, stored = (json.loads(Path(path).read_text())["rows"] for path in (words[0], (words[1:] or [STORED])[0]))
+    found = ratios(new, stored)
+    if not found:
+        print("the two runs have no row in common")
+        return 1
+    for name, ratio in found.items():
+        print(f"{name:40s} {ratio:6.2f} {'slower than ' + str(LIMIT) if ratio > LIMIT else ''}".rstrip())
+    return int(max(found.values()) > LIMIT)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,79 @@
+"""The benchmarks' own arithmetic: what is compared, what counts as slower, and that peers do the same work."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import compare, timing
+from benchmarks.workloads import SIZES, flop, products, workload
+
+TINY = {"task": "cartpole", "search.particles": "20", "model.hidden": "[8,8]", "policy.hidden": "[7]"}
+
+
+@pytest.fixture(scope="module")
+def work():
+    return workload(TINY, horizon=3)
+
+
+def run(path, **times):
+    """A file of a run with these times, relative to its matrix product."""
+    path.write_text(json.dumps({"rows": {name: {"of_matmul": value} for name, value in times.items()}}))
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("new", "fails"),
+    [({"a": 10, "b": 2}, 0), ({"a": 12.9, "b": 2}, 0), ({"a": 13.1, "b": 2}, 1), ({"a": 1}, 0), ({"c": 1}, 1)],
+)
+def test_a_run_fails_when_a_shared_row_is_slower_by_the_limit(new, fails, tmp_path, capsys):
+    code = compare.main([run(tmp_path / "new.json", **new), run(tmp_path / "stored.json", a=10, b=2)])
+    assert code == fails
+    assert ("slower" in capsys.readouterr().out) == (new.get("a") == 13.1)
+
+
+def test_a_row_without_a_ratio_is_not_compared():
+    assert compare.ratios({"a": {"compile_s": 9.0}}, {"a": {"compile_s": 1.0, "of_matmul": 1.0}}) == {}
+
+
+def test_programs_run_in_turn_and_the_first_run_does_not_count():
+    order = []
+    times = timing.in_turn({name: lambda name=name: order.append(name) for name in "ab"}, repeats=3)
+    assert order == list("abababab")
+    assert [len(runs) for runs in times.values()] == [3, 3]
+    assert timing.summary([4.0, 2.0, 9.0], per=2) == {"min_ms": 1.0, "median_ms": 2.0}
+
+
+@pytest.mark.parametrize(("kind", "shape"), [("forward", (5, 3)), ("back", (5, 4)), ("weights", (4, 3))])
+def test_timed_products_have_the_shapes_they_say(kind, shape):
+    assert timing.product(kind, 5, 4, 3, times=2)().shape == shape
+
+
+def test_the_products_of_a_step_are_those_of_its_networks(work):
+    """Model 6-8-8-8, policy 5-7-1 of 20 particles over 3 steps: forward and back, and the policy's weights."""
+    model, policy = 6 * 8 + 8 * 8 + 8 * 8, 5 * 7 + 7 * 1
+    assert flop(work) == 2 * 20 * 3 * (2 * model + 3 * policy)
+    assert products(work)["forward", 20, 8, 8] == 2 * 3
+
+
+def test_a_workload_is_well_conditioned(work):
+    """Objective away from saturation, gradient that float32 can compute: else neither time nor error says much."""
+    value, gradient = jax.jit(jax.value_and_grad(work.objective))(work.state.policy.params, work.belief, work.scenarios)
+    assert 0.05 < value < 0.95
+    assert np.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(gradient)])).all()
+    assert set(SIZES) >= {"cart-pole", "double cart-pole"}
+
+
+@pytest.mark.parametrize("match", ["true", "false"])
+@pytest.mark.parametrize("activation", ["silu", "relu"])
+def test_plain_torch_does_the_same_work(match, activation):
+    pytest.importorskip("torch", reason="the extra `peers` is not installed")
+    from benchmarks.peers import plain_torch
+    from benchmarks.peers.compare import disagreement, problem_of
+
+    given = workload({**TINY, "search.match": match, "model.activation": activation}, horizon=3)
+    objective, gradient = disagreement(given, problem_of(given), plain_torch.step)
+    assert objective < 1e-5
+    assert gradient < 1e-3
