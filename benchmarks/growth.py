@@ -4,9 +4,10 @@
 
 For each method and number of rows n, on the cart-pole: one evaluation of the model's loss and its gradient (of all rows
 for a Gaussian process, of a minibatch for a BNN), conditioning on the data, drawing K = 100 functions, and an iteration
-of the policy search, with its share of the last two. The search follows K particles unless set otherwise, or PILCO's
-analytic moments with an RBF policy, in double precision; H = 25. Prints a table and writes
-benchmarks/results/growth.json. Compare within one run: machines are noisy.
+of the policy search, a quarter of a search of 4: it includes a quarter of one conditioning and of two draws, where a
+search of 100 includes a hundredth. The search follows K particles unless set otherwise, or PILCO's analytic moments
+with an RBF policy, in double precision; H = 25. Prints a table and writes benchmarks/results/growth.json. On a machine
+that others use, pin it to one CPU (`taskset -c 0`): it then counts its own seconds only.
 """
 
 import json
@@ -18,7 +19,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks.suite import RESULTS, matmul, measure
+from benchmarks.suite import RESULTS
+from benchmarks.timing import compiled, in_turn, matmul, summary
 from pegasus_jax import dataset, settings
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.record import about
@@ -63,8 +65,9 @@ def costs(method: dict[str, str], rows: int, words: dict[str, str], repeats: int
         "draw": (jax.vmap(dynamics.sample, (0, None)), keys, belief),
         "search": (partial(experiment.search, steps=STEPS), state, jnp.int32(0)),
     }
+    times = in_turn({name: compiled(*call)[0] for name, call in timed.items()}, repeats)
     per = {"search": STEPS}
-    return {name: measure(*call, repeats=repeats, per=per.get(name, 1))["min_ms"] for name, call in timed.items()}
+    return {name: summary(each, per.get(name, 1))["min_ms"] for name, each in times.items()}
 
 
 def main(words: list[str]) -> None:
@@ -72,7 +75,6 @@ def main(words: list[str]) -> None:
     options, dotted = settings.split(words, ("rows", "repeats"))
     sizes = [int(n) for n in options.get("rows", "50,100,200,400,800").split(",")]
     repeats = int(options.get("repeats", "3"))
-    loop, arguments, _ = matmul()
     table: list[dict[str, Any]] = []
     print(
         f"{'method':12s}{'n':>6s}" + "".join(f"{name + ' ms':>14s}" for name in ("loss", "condition", "draw", "search"))
@@ -83,7 +85,8 @@ def main(words: list[str]) -> None:
             table.append({"method": name, "rows": rows, **row})
             print(f"{name:12s}{rows:6d}" + "".join(f"{value:14.2f}" for value in row.values()), flush=True)
     jax.config.update("jax_enable_x64", False)
-    reference = measure(loop, *arguments, repeats=repeats, per=1000)["min_ms"]
+    products = 500
+    reference = summary(in_turn({"matmul": matmul(products)}, repeats)["matmul"], products)["min_ms"]
     print(f"matmul 100x200x200: {reference:.3f} ms")
     RESULTS.mkdir(exist_ok=True)
     command = shlex.join(["python", "-m", "benchmarks.growth", *words])
