@@ -27,7 +27,7 @@ STEPS, PRODUCTS = 4, 500  # in one call
 PILCO = [
     {"model": model, "policy": policy, "algorithm": "pilco"} for model in ("ssgp", "gp") for policy in ("rbf", "linear")
 ]
-COMBINATIONS = [{"model": model, "policy": policy} for model in MODELS for policy in POLICIES] + PILCO
+COMBINATIONS = [{"model": model, "policy": policy} for policy in POLICIES for model in MODELS] + PILCO
 
 
 def step(words: dict[str, str], repeats: int) -> dict[str, float]:
@@ -44,19 +44,18 @@ def step(words: dict[str, str], repeats: int) -> dict[str, float]:
 
 
 def main(words: list[str]) -> None:
-    """The command line of this module."""
+    """The command line of this module; the file is written after every row."""
     options, dotted = settings.split(words, ("repeats",))
-    rows = []
+    result = {"rows": [], "about": about(shlex.join(["python", "-m", "benchmarks.combinations", *words]))}
+    RESULTS.mkdir(exist_ok=True)
     print(f"{'model':15s}{'policy':14s}{'search':10s}{'ms':>9s}{'products':>10s}{'compile s':>11s}")
     for chosen in COMBINATIONS:
         row = step(chosen | dotted, int(options.get("repeats", "5")))
-        rows.append({**chosen, **row})
+        result["rows"].append({**chosen, **row})
+        (RESULTS / "combinations.json").write_text(json.dumps(result, indent=1) + "\n")
         how = chosen.get("algorithm", "particles")
         numbers = f"{row['min_ms']:9.1f}{row['of_product']:10.0f}{row['compile_s']:11.1f}"
         print(f"{chosen['model']:15s}{chosen['policy']:14s}{how:10s}{numbers}", flush=True)
-    command = shlex.join(["python", "-m", "benchmarks.combinations", *words])
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "combinations.json").write_text(json.dumps({"rows": rows, "about": about(command)}, indent=1) + "\n")
 
 
 if __name__ == "__main__":
