@@ -2,10 +2,12 @@
 
     python -m benchmarks.growth [rows=50,100,200,400,800] [repeats=3] [setting=value ...]
 
-For each model and number of rows n: one evaluation of the loss and its gradient (of all rows for a Gaussian process, of
-a minibatch for a BNN), conditioning on the data, drawing the particles' functions, and a step of the policy search (K =
-100 particles, H = 25 steps unless set otherwise), on the cart-pole. Prints a table and writes
-benchmarks/results/growth.json. Compare within one run: machines are noisy.
+For each method and number of rows n, on the cart-pole: one evaluation of the model's loss and its gradient (of all rows
+for a Gaussian process, of a minibatch for a BNN), conditioning on the data, drawing K = 100 functions, and an iteration
+of the policy search, a quarter of a search of 4: it includes a quarter of one conditioning and of two draws, where a
+search of 100 includes a hundredth. The search follows K particles unless set otherwise, or PILCO's analytic moments
+with an RBF policy, in double precision; H = 25. Prints a table and writes benchmarks/results/growth.json. On a machine
+that others use, pin it to one CPU (`taskset -c 0`): it then counts its own seconds only.
 """
 
 import json
@@ -17,14 +19,24 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks.suite import RESULTS, matmul, measure
+from benchmarks.suite import RESULTS
+from benchmarks.timing import compiled, in_turn, matmul, summary
 from pegasus_jax import dataset, settings
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.record import about
 from pegasus_jax.types import Batch, Dataset, Trajectory
 
-MODELS = ("log_normal", "ssgp", "gp")
-STEPS = 4  # search steps in one call
+PILCO = {"policy": "rbf", "algorithm": "pilco"}
+# name: (what it is, the most rows it is measured with: analytic moments of an exact process take minutes beyond)
+METHODS: dict[str, tuple[dict[str, str], int]] = {
+    "log_normal": ({"model": "log_normal"}, 10**6),
+    "ssgp": ({"model": "ssgp"}, 10**6),
+    "gp": ({"model": "gp"}, 10**6),
+    "pilco, ssgp": ({"model": "ssgp", **PILCO}, 10**6),
+    "pilco, gp": ({"model": "gp", **PILCO}, 200),
+}
+PARTICLES = 100
+STEPS = 4  # search iterations in one call
 
 
 def experience(rows: int, states: int, controls: int) -> Dataset:
@@ -35,9 +47,10 @@ def experience(rows: int, states: int, controls: int) -> Dataset:
     return dataset.add(dataset.empty(rows, states, controls), Trajectory(x, u, jnp.zeros(rows)), ())
 
 
-def costs(model: str, rows: int, words: dict[str, str], repeats: int) -> dict[str, float]:
+def costs(method: dict[str, str], rows: int, words: dict[str, str], repeats: int) -> dict[str, float]:
     """Milliseconds of each part."""
-    config = settings.parse({**words, "model": model, "trials": str(-(-rows // 25))})
+    config = settings.parse({**method, **words, "trials": str(-(-rows // 25))})
+    set_precision(config)
     experiment = build(config)
     dynamics, task = experiment.dynamics, experiment.task
     data = experience(rows, len(task.state_names), len(task.control_names))
@@ -45,15 +58,16 @@ def costs(model: str, rows: int, words: dict[str, str], repeats: int) -> dict[st
     params, prepared = state.model.params, jax.jit(dynamics.prepare)(data)
     batch = Batch(*(column[:100] for column in data[:3]))
     belief = jax.jit(dynamics.condition)(params, data)
-    keys = jax.random.split(jax.random.key(1), config.search.particles)
+    keys = jax.random.split(jax.random.key(1), PARTICLES)
     timed: dict[str, tuple[Any, ...]] = {
         "loss": (jax.value_and_grad(dynamics.loss), params, keys[0], batch, prepared),
         "condition": (dynamics.condition, params, data),
         "draw": (jax.vmap(dynamics.sample, (0, None)), keys, belief),
         "search": (partial(experiment.search, steps=STEPS), state, jnp.int32(0)),
     }
+    times = in_turn({name: compiled(*call)[0] for name, call in timed.items()}, repeats)
     per = {"search": STEPS}
-    return {name: measure(*call, repeats=repeats, per=per.get(name, 1))["min_ms"] for name, call in timed.items()}
+    return {name: summary(each, per.get(name, 1))["min_ms"] for name, each in times.items()}
 
 
 def main(words: list[str]) -> None:
@@ -61,18 +75,18 @@ def main(words: list[str]) -> None:
     options, dotted = settings.split(words, ("rows", "repeats"))
     sizes = [int(n) for n in options.get("rows", "50,100,200,400,800").split(",")]
     repeats = int(options.get("repeats", "3"))
-    set_precision(settings.parse(dotted))
-    loop, arguments, _ = matmul()
     table: list[dict[str, Any]] = []
     print(
-        f"{'model':12s}{'n':>6s}" + "".join(f"{name + ' ms':>14s}" for name in ("loss", "condition", "draw", "search"))
+        f"{'method':12s}{'n':>6s}" + "".join(f"{name + ' ms':>14s}" for name in ("loss", "condition", "draw", "search"))
     )
-    for model in MODELS:
-        for rows in sizes:
-            row = costs(model, rows, dotted, repeats)
-            table.append({"model": model, "rows": rows, **row})
-            print(f"{model:12s}{rows:6d}" + "".join(f"{value:14.2f}" for value in row.values()), flush=True)
-    reference = measure(loop, *arguments, repeats=repeats, per=1000)["min_ms"]
+    for name, (method, most) in METHODS.items():
+        for rows in (n for n in sizes if n <= most):
+            row = costs(method, rows, dotted, repeats)
+            table.append({"method": name, "rows": rows, **row})
+            print(f"{name:12s}{rows:6d}" + "".join(f"{value:14.2f}" for value in row.values()), flush=True)
+    jax.config.update("jax_enable_x64", False)
+    products = 500
+    reference = summary(in_turn({"matmul": matmul(products)}, repeats)["matmul"], products)["min_ms"]
     print(f"matmul 100x200x200: {reference:.3f} ms")
     RESULTS.mkdir(exist_ok=True)
     command = shlex.join(["python", "-m", "benchmarks.growth", *words])

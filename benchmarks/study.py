@@ -20,34 +20,47 @@ from pegasus_jax import settings
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.record import about
-from pegasus_jax.trial import run
+from pegasus_jax.trial import TrialInfo, trial
 
 RESULTS = Path(__file__).parent / "results"
 
 
-def study(config: Config, seeds: list[int]) -> dict[str, Any]:
-    """Curves [S, T] of a configuration over seeds."""
+def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[str, Any]:
+    """Curves [S, T] of a configuration over seeds; written to `path` after every trial, so that nothing is lost."""
     set_precision(config)
     experiment = build(config)
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
+    states = jax.jit(jax.vmap(experiment.init))(keys)
     began = time.monotonic()
-    program = jax.jit(jax.vmap(run(experiment, config.trials))).lower(keys).compile()
+    program = jax.jit(jax.vmap(lambda state: trial(state, experiment))).lower(states).compile()
     compiled = time.monotonic()
-    _, info = jax.block_until_ready(program(keys))
-    ended = time.monotonic()
-    costs = np.asarray(info.evaluation)  # [S, T, E, H]
-    success = np.mean(costs[..., -5:], -1) < experiment.task.success
-    plant_seconds = experiment.task.horizon * experiment.task.dt * np.arange(1, config.trials + 1)
+    infos, result = [], {}
+    for count in range(1, config.trials + 1):
+        states, info = jax.block_until_ready(program(states))
+        infos.append(jax.tree.map(np.asarray, info))
+        result = curves(config, seeds, jax.tree.map(lambda *leaves: np.stack(leaves, 1), *infos))
+        result |= {"compile_seconds": round(compiled - began, 1), "run_seconds": round(time.monotonic() - compiled, 1)}
+        if path is not None:
+            path.write_text(json.dumps(result) + "\n")
+        cost, success = (np.asarray(result[name])[:, -1] for name in ("mean_cost", "success_rate"))
+        print(
+            f"trial {count}  cost {cost.mean():.3f}  solved {np.mean(success >= 0.9):.0%}", file=sys.stderr, flush=True
+        )
+    return result
+
+
+def curves(config: Config, seeds: list[int], info: TrialInfo) -> dict[str, Any]:
+    """What is kept of the trials so far [S, T, ...]."""
+    task, costs = build(config).task, info.evaluation  # [S, T, E, H]
+    success = np.mean(costs[..., -5:], -1) < task.success
     return {
         "seeds": seeds,
-        "plant_seconds": np.round(plant_seconds, 6).tolist(),
+        "plant_seconds": np.round(task.horizon * task.dt * np.arange(1, costs.shape[1] + 1), 6).tolist(),
         "mean_cost": np.round(costs.mean((2, 3)), 4).tolist(),
         "success_rate": success.mean(2).tolist(),
-        "episode_cost": np.round(np.asarray(info.trajectory.cost).mean(2), 4).tolist(),
-        "objective_last": np.round(np.asarray(info.search.objective)[..., -1], 4).tolist(),
-        "skipped_updates": np.asarray(info.search.skipped).tolist(),
-        "compile_seconds": round(compiled - began, 1),
-        "run_seconds": round(ended - compiled, 1),
+        "episode_cost": np.round(info.trajectory.cost.mean(2), 4).tolist(),
+        "objective_last": np.round(info.search.objective[..., -1], 4).tolist(),
+        "skipped_updates": info.search.skipped.tolist(),
         "config": {k: list(v) if isinstance(v, tuple) else v for k, v in settings.leaves(config).items()},
     }
 
@@ -82,10 +95,11 @@ def main(words: list[str]) -> None:
     name, *rest = words
     options, dotted = settings.split(rest, ("seeds",))
     config = settings.parse(dotted)
-    result = study(config, seed_list(options.get("seeds", "0-9")))
-    result["about"] = about(shlex.join(["python", "-m", "benchmarks.study", *words]))
+    path = RESULTS / f"{name}.json"
     RESULTS.mkdir(exist_ok=True)
-    (RESULTS / f"{name}.json").write_text(json.dumps(result) + "\n")
+    result = study(config, seed_list(options.get("seeds", "0-9")), path)
+    result["about"] = about(shlex.join(["python", "-m", "benchmarks.study", *words]))
+    path.write_text(json.dumps(result) + "\n")
     print(f"## {name}: compiled in {result['compile_seconds']} s, ran {result['run_seconds']} s")
     print(table(result), flush=True)
 

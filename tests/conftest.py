@@ -1,5 +1,11 @@
 """What every test shares: key reuse is an error, property tests are repeatable, and float64 is one fixture away."""
 
+import os
+
+# Before jax loads LAPACK: two test processes on two cores, each with a thread a core that spins while it waits, made a
+# Cholesky factor of 375 rows take a second instead of a millisecond.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 import pytest
 from hypothesis import settings

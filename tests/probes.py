@@ -55,6 +55,7 @@ def cart(horizon: int = 8) -> Task:
         state_names=("x", "v"),
         control_names=("u",),
         expected_cost=cost.expected_saturating(lambda x: x, 1.0, ()),
+        widened=partial(cost.widened, lambda x: x, 1.0, ()),
     )
 
 
@@ -90,6 +91,7 @@ def dial(horizon: int = 6) -> Task:
         state_names=("angle",),
         control_names=("turn",),
         expected_cost=cost.expected_saturating(error, 0.5, (0,)),
+        widened=partial(cost.widened, error, 0.5, (0,)),
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from pegasus_jax import config, cost, dataset, moments, scenarios, settings, types
 from pegasus_jax.build import AGGREGATES, EXPLORATIONS, build, compose, dropout_of, search_of, start
-from pegasus_jax.config import ALGORITHMS, DROPOUTS, MODELS, POLICIES, Config, Period, SettingError
+from pegasus_jax.config import DROPOUTS, Config, Period, SettingError
 from pegasus_jax.dynamics.bnn import HEADS
 from pegasus_jax.dynamics.gp import gp
 from pegasus_jax.dynamics.ssgp import ssgp
@@ -19,6 +19,7 @@ from pegasus_jax.network import INITIALISERS
 from pegasus_jax.policy.squash import SQUASHES
 from pegasus_jax.search import objective
 from pegasus_jax.trial import SEARCH, trial_key
+from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
 from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, same, tiny
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
@@ -137,7 +138,9 @@ def eagerly(function):
 
 def searcher(gain=-0.5, **search):
     """An experiment under a config, its first state, and a one-step search from it."""
-    chosen = dataclasses.replace(tiny(), search=config.Search(**{"steps": 1, "particles": 5, **search}))
+    chosen = dataclasses.replace(
+        tiny(), search=config.Search(**{"steps": 1, "particles": 5, "cost": "particles", "widen": 1.0, **search})
+    )
     policy = linear_policy(2, 1)._replace(init=lambda key: gain * jnp.array([[1.0, 1.6]]))
     exp = compose(chosen, cart(horizon=2), dynamics=known(PENDULUM, noise_std=0.2), policy=policy)
     return exp, exp.init(jax.random.key(0)), eagerly(exp.search)
@@ -150,13 +153,37 @@ def first_objective(**search):
 
 def test_settings_of_the_search_reach_the_objective():
     plain = first_objective()
-    changes = dict(match=False, balanced=True, discount=0.5, aggregate="total", risk=0.4, cost="matched")
+    changes = dict(match=False, balanced=True, discount=0.5, aggregate="total", risk=0.4, cost="matched", widen=2.0)
     values = {name: first_objective(**{name: value}) for name, value in changes.items()}
     np.testing.assert_allclose(values.pop("aggregate"), 2 * plain, rtol=1e-4)  # the sum over 2 steps
     assert values["discount"] < 0.9 * plain
     assert values["risk"] > 1.01 * plain  # the worst two of five
     assert all(abs(value - plain) > 1e-6 for value in values.values()), values
     assert len(set(values.values())) == len(values)
+
+
+@pytest.mark.parametrize("of", ["particles", "matched"])
+def test_a_search_starts_with_the_wider_cost_and_ends_with_the_tasks(of):
+    """A cost twice as wide is the task's cost of half the error; from half of the search on it is the task's own."""
+    wide = float(searcher(cost=of, widen=2.0)[2](searcher(cost=of)[1])[1].objective[0])
+    halved = cart(horizon=2)._replace(
+        cost=cost.saturating(lambda x: x / 2, 1.0), expected_cost=cost.expected_saturating(lambda x: x / 2, 1.0, ())
+    )
+    chosen = dataclasses.replace(tiny(), search=config.Search(steps=1, particles=5, cost=of, widen=1.0))
+    exp, state, _ = searcher()
+    by_hand = compose(chosen, halved, dynamics=exp.dynamics, policy=exp.policy).search
+    np.testing.assert_allclose(wide, eagerly(by_hand)(state)[1].objective[0], rtol=1e-5)
+    slow = dict(cost=of, steps=4, learning_rate=1e-30)
+    narrowed, plain = (searcher(**slow, widen=widen) for widen in (2.0, 1.0))
+    values = [run(state)[1].objective for _, state, run in (narrowed, plain)]
+    np.testing.assert_allclose(values[0][2:], values[1][2:], rtol=1e-5)
+    assert np.all(values[0][:2] < 0.9 * values[1][:2])
+
+
+def test_a_cost_without_a_width_cannot_be_widened():
+    task = cart(horizon=2)._replace(widened=None)
+    with pytest.raises(SettingError, match=r"search\.widen=4 needs a cost with a width.*the nearest is 1"):
+        compose(tiny(), task)
 
 
 def test_truncation_reaches_the_gradient_and_only_that():

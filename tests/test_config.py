@@ -38,6 +38,7 @@ def test_the_defaults_are_the_measured_ones():
     assert (c.search.match, c.search.aggregate, c.search.discount) == (True, "mean", 1.0)
     assert c.search.period == Period(start=1, dynamics=100, policy=1, sensor=1, match=1)
     assert (c.model.activation, c.model.kl_weight, c.search.restart) == ("silu", 0.1, True)
+    assert (c.search.cost, c.search.widen) == ("matched", 4.0)  # docs/decisions/0002
     assert (c.explore.trials, c.explore.kind) == (1, "uniform")
 
 

@@ -145,6 +145,18 @@ def test_the_cost_of_a_task_and_its_expectation_agree_where_the_state_is_known(x
     np.testing.assert_allclose(known, jax.vmap(task.cost)(x), atol=1e-12)
 
 
+def test_a_widened_cost_is_that_of_a_smaller_error(x64):
+    """And the width may be traced."""
+    error = lambda x: jnp.array([x[0] - jnp.cos(x[1])])  # noqa: E731
+    noise = np.random.default_rng(4)
+    x, root = noise.normal(size=2), 0.3 * noise.normal(size=(2, 2))
+    of_state, of_gaussian = (jax.jit(lambda f, *a, i=i: cost.widened(error, 0.7, (1,), f)[i](*a)) for i in range(2))
+    third = lambda x: error(x) / 3  # noqa: E731
+    np.testing.assert_allclose(of_state(3.0, x), cost.saturating(third, 0.7)(x), rtol=1e-10)
+    expected = cost.expected_saturating(third, 0.7, (1,))(x, root @ root.T)
+    np.testing.assert_allclose(of_gaussian(3.0, x, root @ root.T), expected, rtol=1e-10)
+
+
 def test_the_matched_cost_is_that_of_the_particles_gaussian(x64):
     expected = cost.expected_saturating(lambda x: jnp.array([x[0] - jnp.cos(x[1])]), 0.7, (1,))
     x = np.random.default_rng(3).normal(size=(3, 9, 2))

@@ -32,11 +32,11 @@ def test_it_finds_the_minimum_that_scipy_finds(x64):
 def test_the_value_falls_with_every_step_allowed():
     start = jnp.array([-1.2, 1.0, 0.5, 2.0, -1.0])
     run = jax.jit(lambda steps: minimise(rosenbrock, start, steps))
-    found = [run(n) for n in (0, 1, 2, 5, 10, 20)]
+    found = [run(n) for n in (1, 2, 5, 10, 20)]
     values = [float(f.value) for f in found]
     assert values == sorted(values, reverse=True)
     assert len(set(values)) == len(values)
-    assert [int(f.steps) for f in found] == [0, 1, 2, 5, 10, 20]
+    assert [int(f.steps) for f in found] == [1, 2, 5, 10, 20]
     for f in found:
         np.testing.assert_allclose(f.value, rosenbrock(f.params), rtol=1e-5)
 
@@ -94,7 +94,7 @@ def test_it_starts_from_the_best_of_its_starts_and_the_current_parameters():
     poor = Learner(jnp.full((3, 2), 50.0), fitter.init(None))
     started = run(jax.random.key(0), poor, data(), 0)
     value = model.loss(started[0].params, None, None, data())
-    np.testing.assert_allclose([started[1].first, started[1].loss], [value, value], rtol=1e-6)
+    np.testing.assert_allclose(started[1].first, value, rtol=1e-6)
     drawn = [model.loss(model.init(key), None, None, data()) for key in jax.random.split(jax.random.key(1), 200)]
     assert value < np.quantile(drawn, 0.2)  # one among 20 is, but for one chance in 100
     good = Learner(jnp.asarray(SLOPE + 0.01), fitter.init(None))

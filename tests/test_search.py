@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 from pegasus_jax import cost, moments, scenarios
 from pegasus_jax.fit import guarded
 from pegasus_jax.rollout import NoiseUse
-from pegasus_jax.search import keeping_best, objective, optimise, remembering
+from pegasus_jax.search import keeping_best, narrowing, objective, optimise, remembering
 from pegasus_jax.types import Learner, Period, Scenarios, Searcher
 from probes import (
     PENDULUM,
@@ -233,6 +233,26 @@ def test_the_search_is_gradient_descent_on_the_scenarios_of_each_iteration():
     first = distance(jnp.ones(3), 1.0, follow(jax.random.key(7), 0, None))
     np.testing.assert_allclose(info.objective[0], first, rtol=1e-6)
     np.testing.assert_allclose(info.gradient_norm[0], 2 * np.sqrt(first), rtol=1e-5)
+
+
+def test_the_width_narrows_geometrically_and_stays():
+    np.testing.assert_allclose(jax.vmap(narrowing(4.0, 10))(jnp.arange(0, 25, 5)), [4, 2, 1, 1, 1], rtol=1e-6)
+
+
+def test_each_iteration_has_its_width_wherever_the_search_is_cut():
+    optimizer = guarded(remembering(optax.adam(0.1)))
+    pieces = dict(draw=follow, redraw=lambda key, step, held, belief: follow(key, step, belief), optimizer=optimizer)
+    widths = dict(width=narrowing(4.0, 3), objective=lambda params, *rest: distance(params, *rest[:2]) / rest[2])
+    run = partial(optimise, **pieces, **widths)
+    whole, info = run(jax.random.key(7), begin(optimizer), 1.0, steps=6)
+    half, _ = run(jax.random.key(7), begin(optimizer), 1.0, steps=2)
+    rest, last = run(jax.random.key(7), half, 1.0, steps=4, first=2)
+    np.testing.assert_allclose(rest.params, whole.params, rtol=1e-5)
+    np.testing.assert_allclose(last.objective, info.objective[2:], rtol=1e-5)
+    first = distance(jnp.ones(3), 1.0, follow(jax.random.key(7), 0, None))
+    np.testing.assert_allclose(info.objective[0], first / 4, rtol=1e-6)
+    best = optax.tree.get(whole.optimizer, "best_value")
+    assert best == info.objective[3:].min(), "values of a wider cost do not count"
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])

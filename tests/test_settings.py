@@ -10,23 +10,9 @@ from hypothesis import strategies as st
 
 from pegasus_jax import config, settings
 from pegasus_jax.build import compose
-from pegasus_jax.config import (
-    ALGORITHMS,
-    BNN,
-    KINDS,
-    MLP,
-    MODELS,
-    POLICIES,
-    RBF,
-    Analytic,
-    Config,
-    Explore,
-    Fit,
-    Period,
-    Search,
-    SettingError,
-)
+from pegasus_jax.config import BNN, MLP, RBF, Analytic, Config, Explore, Fit, Period, Search, SettingError
 from pegasus_jax.tasks import TASKS
+from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 from probes import cart
 
 
@@ -157,7 +143,8 @@ def test_a_variant_brings_defaults_that_single_settings_change():
     for order in (words, words[::-1]):
         chosen = parse(*order)
         assert chosen.model == BNN(dropout="binary", rate=0.3, activation="relu", kl_weight=1.0)
-        assert chosen.search == Search(particles=10, clip=1.0, restart=False, period=Period(1, 1, 1, 1, 0))
+        plain = Search(cost="particles", widen=1.0, particles=10, clip=1.0, restart=False)
+        assert chosen.search == dataclasses.replace(plain, period=Period(1, 1, 1, 1, 0))
 
 
 def test_the_paper_is_a_variant():
@@ -166,6 +153,7 @@ def test_the_paper_is_a_variant():
     assert chosen.search.period == Period(start=1, dynamics=0, policy=0, sensor=0, match=0)
     assert (chosen.model.activation, chosen.model.kl_weight, chosen.fit.learning_rate) == ("relu", 1.0, 1e-4)
     assert (chosen.search.clip, chosen.search.particles) == (1, 100)
+    assert (chosen.search.cost, chosen.search.widen) == ("particles", 1)
     assert not chosen.search.reset
     assert not chosen.search.restart
 

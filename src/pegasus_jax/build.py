@@ -24,7 +24,7 @@ from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.rbf import rbf
 from pegasus_jax.policy.squash import SQUASHES, to_limits
 from pegasus_jax.rollout import NoiseUse, rollout
-from pegasus_jax.search import keeping_best, objective, particles, remembering
+from pegasus_jax.search import keeping_best, narrowing, objective, particles, remembering
 from pegasus_jax.types import (
     Array,
     Dropout,
@@ -36,6 +36,7 @@ from pegasus_jax.types import (
     Period,
     Policy,
     Rollout,
+    Scenarios,
     Searcher,
     Task,
 )
@@ -127,16 +128,20 @@ def search_of(
     pieces: dict[str, Any] = dict(
         dynamics=dynamics, policy=policy, match=moments.match if search.match else moments.keep, noise=noise
     )
-    period, costs = Period(**vars(search.period)), cost.of_particles(task.cost)
-    if search.cost == "matched":
-        costs = cost.of_matched(expected_cost_of(task, "search.cost=matched"))
+    ends: dict[str, Any] = dict(aggregate=discounted(search, aggregate), truncate=search.truncate)
+    costs = costs_of(search, task)
+
+    def value(params: Params, belief: Params, given: Scenarios, *width: Array) -> Array:
+        return objective(params, belief, given, **pieces, **ends, cost=costs(*width))
+
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
     searcher = particles(
-        partial(objective, **pieces, cost=costs, aggregate=discounted(search, aggregate), truncate=search.truncate),
+        value,
         remembering(optimizer) if search.best else optimizer,
         blocks=blocks,
-        period=period,
+        period=Period(**vars(search.period)),
+        width=narrowing(search.widen, search.steps / 2) if search.widen > 1 else None,
     )
     imagine = partial(imagined, **pieces, blocks=blocks, cost=task.cost)
     return keeping_best(searcher, search.steps) if search.best else searcher, imagine
@@ -183,6 +188,26 @@ def analytic_search_of(
     blocks = blocks_of(search.particles, task, dynamics, policy)
     imagine = partial(imagined, **pieces, blocks=blocks, cost=task.cost, match=moments.keep, noise=noise)
     return pilco.analytic(value, noise_std), imagine
+
+
+def costs_of(search: settings.Search, task: Task) -> Callable[..., Callable[[Array], Array]]:
+    """(a factor of the cost's width, or nothing) -> what makes costs of imagined states; as the search says.
+
+    Raises SettingError where the task's cost has no expectation or no width.
+    """
+    if search.cost == "matched":
+        expected_cost_of(task, "search.cost=matched")
+    if search.widen > 1 and task.widened is None:
+        raise settings.SettingError(
+            f"search.widen={search.widen:g} needs a cost with a width, which that of task={task.name} lacks;"
+            " the nearest is 1"
+        )
+
+    def costs(*width: Array) -> Callable[[Array], Array]:
+        of_state, expected = task.widened(*width) if task.widened and width else (task.cost, task.expected_cost)
+        return cost.of_matched(expected) if search.cost == "matched" and expected else cost.of_particles(of_state)
+
+    return costs
 
 
 def expected_cost_of(task: Task, setting: str) -> cost.Expected:

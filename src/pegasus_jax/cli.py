@@ -248,8 +248,8 @@ def _help(text: str) -> str:
     if "{settings}" not in text:
         return text
     from pegasus_jax import settings
-    from pegasus_jax.config import ALGORITHMS, KINDS, MODELS, POLICIES
     from pegasus_jax.tasks import NAMES
+    from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 
     named = dict(tasks=NAMES, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
     lists = {name: ", ".join(values) for name, values in named.items()}

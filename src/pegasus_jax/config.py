@@ -250,7 +250,8 @@ class Search:
     balanced: bool = setting(False, "make the drawn noise exactly zero mean, unit covariance over the particles")
     aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
     discount: float = setting(1.0, "weight of a later step against the one before")
-    cost: str = setting("particles", "of each of the particles, or the expected one of the matched Gaussian: matched")
+    cost: str = setting("matched", "expected one of the matched Gaussian, or of each of the particles: particles")
+    widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
@@ -274,6 +275,7 @@ class Search:
         _within("search.risk", self.risk, 0, 1, open_low=True)
         if self.risk < 1 and self.cost == "matched":
             raise SettingError(f"search.risk={self.risk:g} needs the cost of each particle: search.cost=particles")
+        _within("search.widen", self.widen, 1)
         if self.truncate is not None:
             _within("search.truncate", self.truncate, 1)
         for name in ("policy_noise", "state_noise", "cost_noise"):
@@ -285,7 +287,7 @@ class Analytic:
     """Policy search after each fit, PILCO's: L-BFGS on the expected cost of a Gaussian, propagated analytically."""
 
     kind: str = setting("analytic", "")
-    steps: int = setting(100, "iterations of L-BFGS a trial")
+    steps: int = setting(300, "iterations of L-BFGS a trial, at most")
     particles: int = setting(100, "K, rollouts imagined afterwards for the record; the search has none")
     aggregate: str = setting("mean", "over the horizon: mean, or total, PILCO's sum")
     discount: float = setting(1.0, "weight of a later step against the one before")
@@ -357,63 +359,3 @@ class Config:
             _within("horizon", self.horizon, 1)
         _within("seed", self.seed, 0, 2**32 - 1)
         _within("trials", self.trials, 1, 10_000)
-
-
-# The named variants that `model=`, `policy=` and `algorithm=` select: what each changes in the defaults, whole sections
-# first. A dotted change counts only where the chosen sections have such a setting.
-MODELS: dict[str, dict[str, Any]] = {
-    "log_normal": {},
-    "binary": {"model": BNN(dropout="binary")},
-    "concrete": {"model": BNN(dropout="concrete")},
-    "gaussian": {"model": BNN(dropout="gaussian")},
-    "sparse": {"model": BNN(dropout="sparse")},
-    "deterministic": {"model": BNN(dropout="none")},
-    "ensemble": {"model": BNN(dropout="none", members=5)},
-    # The number of steps once more, because a task's own is meant for minibatches.
-    "gp": {"model": GP(), "fit": LBFGS(starts=10), "fit.steps": 300},
-    "ssgp": {"model": SSGP(), "fit": LBFGS(), "fit.steps": 300},
-}
-POLICIES: dict[str, dict[str, Any]] = {
-    "dropout_mlp": {},
-    "mlp": {"policy": MLP(dropout=0.0)},
-    "rbf": {"policy": RBF()},
-    "rbf100": {"policy": RBF(units=100)},
-    "linear": {"policy": Linear()},
-}
-ALGORITHMS: dict[str, dict[str, Any]] = {
-    "pegasus": {},  # the defaults: what learned best (docs/decisions/0001)
-    "paper": {  # Alg. 3 as printed: all draws but the start particles held for a whole search
-        "model.activation": "relu",
-        "model.kl_weight": 1.0,
-        "fit.learning_rate": 1e-4,
-        "search.period.start": 1,
-        "search.period.dynamics": 0,
-        "search.period.policy": 0,
-        "search.period.sensor": 0,
-        "search.period.match": 0,
-        "search.reset": False,
-        "search.restart": False,
-    },
-    "deep_pilco": {  # Alg. 2: everything redrawn every iteration, no clipping
-        "model.activation": "relu",
-        "model.kl_weight": 1.0,
-        "fit.learning_rate": 1e-4,
-        "search.restart": False,
-        "search.particles": 10,
-        "search.clip": None,
-        "search.period.start": 1,
-        "search.period.dynamics": 1,
-        "search.period.policy": 1,
-        "search.period.sensor": 1,
-        "search.period.match": 1,
-    },
-    "pilco": {"search": Analytic(), "search.steps": Analytic.steps, "precision": "double"},
-}
-
-# What each section can be, by the kind that a stored config names.
-KINDS: dict[str, dict[str, Any]] = {
-    "model": {"bnn": BNN(), "gp": GP(), "ssgp": SSGP()},
-    "policy": {"mlp": MLP(), "rbf": RBF(), "linear": Linear()},
-    "fit": {"adam": Fit(), "lbfgs": LBFGS()},
-    "search": {"particles": Search(), "analytic": Analytic()},
-}

@@ -16,7 +16,7 @@ Expected = Callable[[Array, Array], Array]  # (mean [D], cov [D, D]) of a Gaussi
 Aggregate = Callable[[Array], Array]  # costs [H, K] -> scalar
 
 
-def saturating(error: Error, width: float) -> Cost:
+def saturating(error: Error, width: Array | float) -> Cost:
     """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; docs/reference.md 1.3)."""
 
     def cost(x: Array) -> Array:
@@ -42,7 +42,7 @@ def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Ar
     return jnp.concatenate([linear, (up - down) / 2, cosine]).T, origin - jnp.sum(cosine, 0)
 
 
-def expected_saturating(error: Error, width: float, angles: tuple[int, ...]) -> Expected:
+def expected_saturating(error: Error, width: Array | float, angles: tuple[int, ...]) -> Expected:
     """The expectation of `saturating(error, width)` of a Gaussian state, as PILCO has it (docs/reference.md 1.3).
 
     The features of the state are taken for Gaussian, with their exact moments: exact without angles, and as close as
@@ -55,6 +55,11 @@ def expected_saturating(error: Error, width: float, angles: tuple[int, ...]) -> 
         return saturating_cost(features.mean, features.cov, matrix, offset, width)
 
     return expected
+
+
+def widened(error: Error, width: float, angles: tuple[int, ...], factor: Array | float) -> tuple[Cost, Expected]:
+    """`saturating` and `expected_saturating` of the same error, `factor` times as wide."""
+    return saturating(error, width * factor), expected_saturating(error, width * factor, angles)
 
 
 def of_particles(cost: Cost) -> Callable[[Array], Array]:

@@ -87,7 +87,7 @@ def concrete(rate: float = 0.1, temperature: float = 0.1) -> Dropout:
         return side * outer + (1.0 - 2.0 * side) * jax.nn.sigmoid(-logit)
 
     return Dropout(
-        init=lambda key, width: {"logit": jnp.full((width,), start)},
+        init=lambda key, width: {"logit": jnp.full((width,), start, float)},
         sample=lambda key, width: _logit(_open_uniform(key, width)),
         mask=lambda params, noise: jax.nn.sigmoid((noise - params["logit"]) / temperature),
         kl=kl,
@@ -170,7 +170,7 @@ def log_normal(
     def init(key, width):
         location = math.log(initial_location / (1.0 - initial_location))
         scale = jax.random.uniform(key, (width,), minval=initial_scale[0], maxval=initial_scale[1])
-        return {"location": jnp.full((width,), location), "scale": scale}
+        return {"location": jnp.full((width,), location, float), "scale": scale}
 
     def normal(params):
         """mu, sigma of log z before truncation, and the interval in units of sigma, alpha <= 0 <= beta."""
@@ -205,7 +205,7 @@ def log_normal(
 def _normal(name, start, log_alpha, kl):
     """z ~ N(1, alpha) with log alpha a function of the one parameter `name`."""
     return Dropout(
-        init=lambda key, width: {name: jnp.full((width,), start)},
+        init=lambda key, width: {name: jnp.full((width,), start, float)},
         sample=lambda key, width: jax.random.normal(key, (width,)),
         mask=lambda params, noise: 1.0 + jnp.exp(0.5 * log_alpha(params)) * noise,
         kl=kl,

@@ -27,7 +27,9 @@ class Descent(NamedTuple):
 def begin(params: Params) -> Descent:
     """The descent from `params`, before its first step."""
     zero = jnp.int32(0)
-    return Descent(params, jnp.full((), jnp.inf), optax.lbfgs(memory_size=MEMORY).init(params), zero, zero, zero)
+    start = Descent(params, jnp.inf, optax.lbfgs(memory_size=MEMORY).init(params), zero, zero, zero)  # type: ignore[arg-type]
+    # Of the types that the first step will give: weak ones would have a search traced twice.
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.result_type(leaf)), start)
 
 
 def step(function: Callable[[Params], Array], d: Descent) -> tuple[Descent, tuple[Any, Params]]:

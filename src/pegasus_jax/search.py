@@ -14,6 +14,8 @@ from pegasus_jax.rollout import NoiseUse, rollout
 from pegasus_jax.scenarios import Blocks, draw, redraw
 from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Period, Policy, Scenarios, Searcher
 
+Schedule = Callable[[Array | int], Array]  # iteration -> a factor of the width of the cost
+
 
 class Remembering(NamedTuple):
     """State of an optimiser that remembers the best parameters it has seen."""
@@ -81,14 +83,16 @@ def optimise(
     *,
     draw: Callable[[Key, Array, Params], Scenarios],
     redraw: Callable[[Key, Array, Scenarios, Params], Scenarios],
-    objective: Callable[[Params, Params, Scenarios], Array],
+    objective: Callable[..., Array],
     optimizer: optax.GradientTransformation,
     steps: int,
     first: Array | int = 0,
+    width: Schedule | None = None,
 ) -> tuple[Learner, SearchInfo]:
     """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 19).
 
-    One call of n steps and two calls of n/2, the second with first=n/2, do the same.
+    One call of n steps and two calls of n/2, the second with first=n/2, do the same. With a `width`, the objective
+    takes one more argument, its value at the iteration.
     """
     first = jnp.asarray(first, jnp.int32)
     optimizer = optax.with_extra_args_support(optimizer)
@@ -96,8 +100,10 @@ def optimise(
 
     def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], tuple[Array, Array]]:
         learner, scenarios = carry
-        value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios)
-        updates, state = optimizer.update(gradient, learner.optimizer, learner.params, value=value)
+        value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios, *_at(width, i))
+        # A wider cost is a lower one: its value says nothing about which parameters are best.
+        known = value if width is None else jnp.where(width(i) > 1, jnp.inf, value)
+        updates, state = optimizer.update(gradient, learner.optimizer, learner.params, value=known)
         learner = Learner(optax.apply_updates(learner.params, updates), state)
         scenarios = redraw(key, i + 1, scenarios, belief)
         return (learner, scenarios), (value, optax.tree.norm(gradient))
@@ -107,25 +113,39 @@ def optimise(
     return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
 
 
+def narrowing(widest: float, over: float) -> Schedule:
+    """A factor of the cost's width that falls from `widest` at iteration 0 to 1 at iteration `over`, geometrically."""
+    return lambda i: widest ** jnp.maximum(0.0, 1 - i / over)
+
+
+def _at(width: Schedule | None, i: Array | int) -> tuple[Array, ...]:
+    return () if width is None else (width(i),)
+
+
 def particles(
-    objective: Callable[[Params, Params, Scenarios], Array],
+    objective: Callable[..., Array],
     optimizer: optax.GradientTransformation,
     *,
     blocks: Blocks,
     period: Period,
+    width: Schedule | None = None,
 ) -> Searcher:
-    """The searcher that follows the gradient of `objective` under scenarios drawn from `blocks`, held for `period`."""
+    """The searcher that follows the gradient of `objective` under scenarios drawn from `blocks`, held for `period`.
+
+    The objective takes (policy parameters, belief, scenarios) and, with a `width`, its value at the iteration.
+    """
     optimizer = guarded(optimizer)
     pieces: dict[str, Any] = dict(
         draw=partial(draw, blocks=blocks, period=period),
         redraw=partial(redraw, blocks=blocks, period=period),
         objective=objective,
         optimizer=optimizer,
+        width=width,
     )
     return Searcher(
         init=optimizer.init,
         run=partial(optimise, **pieces),
-        value=lambda key, params, belief: objective(params, belief, pieces["draw"](key, 0, belief)),
+        value=lambda key, params, belief: objective(params, belief, pieces["draw"](key, 0, belief), *_at(width, 0)),
     )
 
 

@@ -10,8 +10,9 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from pegasus_jax import tasks
-from pegasus_jax.config import ALGORITHMS, KINDS, MODELS, POLICIES, Config, SettingError, nearest
+from pegasus_jax.config import Config, SettingError, nearest
 from pegasus_jax.record import write_whole
+from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 
 # Keys that select a named variant, and what they select from.
 VARIANTS: dict[str, Any] = {"task": tasks.NAMES, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}

@@ -20,7 +20,7 @@ from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
 from pegasus_jax.config import Config, SettingError, nearest
-from pegasus_jax.cost import expected_saturating, saturating
+from pegasus_jax.cost import expected_saturating, saturating, widened
 from pegasus_jax.types import Task
 
 
@@ -41,6 +41,7 @@ def of_plant(name: str, plant: Plant) -> Task:
         state_names=plant.state_names,
         control_names=plant.control_names,
         expected_cost=expected_saturating(plant.error, plant.width, plant.angles),
+        widened=partial(widened, plant.error, plant.width, plant.angles),
     )
 
 
@@ -54,6 +55,9 @@ TASKS: dict[str, Callable[[Any], Plant]] = {
 GYM = "gym"  # the task that `env=` and `cost=` describe
 MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe
 NAMES = (*TASKS, GYM, MJCF)
+
+# A cost of one's own has neither an expectation nor a width; and so the swimmer was measured.
+_PLAIN_COST: dict[str, Any] = {"search.cost": "particles", "search.widen": 1.0}
 
 # docs/reference.md 2.2; the paper's networks and step size.
 _DOUBLE_CARTPOLE: dict[str, Any] = {
@@ -75,6 +79,7 @@ _SWIMMER: dict[str, Any] = {
     "search.learning_rate": 1e-4,
     "explore.trials": 5,
     "explore.kind": "walk",
+    **_PLAIN_COST,
 }
 _LEGS: dict[int, dict[str, Any]] = {
     2: {"search.particles": 400, "fit.steps": 2000},
@@ -84,7 +89,9 @@ _LEGS: dict[int, dict[str, Any]] = {
 
 def defaults(name: str, legs: int = 2) -> dict[str, Any]:
     """What a task changes in the defaults of config.py, by dotted name."""
-    if name in ("cartpole", GYM, MJCF):
+    if name in (GYM, MJCF):
+        return _PLAIN_COST
+    if name == "cartpole":
         return {}
     if name == "double_cartpole":
         return _DOUBLE_CARTPOLE

@@ -134,6 +134,8 @@ class Task(NamedTuple):
     success: float = 0.2  # a rollout whose last five steps cost less than this on average has succeeded
     # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not known in closed form
     expected_cost: Callable[[Array, Array], Array] | None = None
+    # A factor -> (cost, expected_cost) of the same error with that many times the width. None: the cost has no width.
+    widened: Callable[[Array], tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]] | None = None
 
 
 class Learner(NamedTuple):

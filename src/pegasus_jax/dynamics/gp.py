@@ -112,8 +112,11 @@ def gram(h: Hyper, x: Array, used: Array) -> Array:
 
 def cross(h: Hyper, z: Array, x: Array) -> Array:
     """Kernel values [E, N] between one input z [F] and rows x [N, F]."""
-    distance = jnp.sum(((z - x) / h.lengthscale[:, None]) ** 2, -1)
-    return h.signal[:, None] ** 2 * jnp.exp(-0.5 * distance)
+
+    def one(lengthscale: Array, signal: Array) -> Array:
+        return signal**2 * jnp.exp(-0.5 * kernel.squared_distance((z / lengthscale)[None], x / lengthscale)[0])
+
+    return jax.vmap(one)(h.lengthscale, h.signal)
 
 
 def solve(root: Array, y: Array) -> Array:

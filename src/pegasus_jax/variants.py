@@ -1,0 +1,68 @@
+"""The words that choose several settings at once: `model=`, `policy=` and `algorithm=`."""
+
+from typing import Any
+
+from pegasus_jax.config import BNN, GP, LBFGS, MLP, RBF, SSGP, Analytic, Fit, Linear, Search
+
+# The named variants that `model=`, `policy=` and `algorithm=` select: what each changes in the defaults, whole sections
+# first. A dotted change counts only where the chosen sections have such a setting.
+MODELS: dict[str, dict[str, Any]] = {
+    "log_normal": {},
+    "binary": {"model": BNN(dropout="binary")},
+    "concrete": {"model": BNN(dropout="concrete")},
+    "gaussian": {"model": BNN(dropout="gaussian")},
+    "sparse": {"model": BNN(dropout="sparse")},
+    "deterministic": {"model": BNN(dropout="none")},
+    "ensemble": {"model": BNN(dropout="none", members=5)},
+    # The number of steps once more, because a task's own is meant for minibatches.
+    "gp": {"model": GP(), "fit": LBFGS(starts=10), "fit.steps": 300},
+    "ssgp": {"model": SSGP(), "fit": LBFGS(), "fit.steps": 300},
+}
+POLICIES: dict[str, dict[str, Any]] = {
+    "dropout_mlp": {},
+    "mlp": {"policy": MLP(dropout=0.0)},
+    "rbf": {"policy": RBF()},
+    "rbf100": {"policy": RBF(units=100)},
+    "linear": {"policy": Linear()},
+}
+ALGORITHMS: dict[str, dict[str, Any]] = {
+    "pegasus": {},  # the defaults: what learned best (docs/decisions)
+    "paper": {  # Alg. 3 as printed: all draws but the start particles held for a whole search
+        "model.activation": "relu",
+        "model.kl_weight": 1.0,
+        "fit.learning_rate": 1e-4,
+        "search.period.start": 1,
+        "search.period.dynamics": 0,
+        "search.period.policy": 0,
+        "search.period.sensor": 0,
+        "search.period.match": 0,
+        "search.cost": "particles",
+        "search.widen": 1.0,
+        "search.reset": False,
+        "search.restart": False,
+    },
+    "deep_pilco": {  # Alg. 2: everything redrawn every iteration, no clipping
+        "model.activation": "relu",
+        "model.kl_weight": 1.0,
+        "fit.learning_rate": 1e-4,
+        "search.restart": False,
+        "search.particles": 10,
+        "search.cost": "particles",
+        "search.widen": 1.0,
+        "search.clip": None,
+        "search.period.start": 1,
+        "search.period.dynamics": 1,
+        "search.period.policy": 1,
+        "search.period.sensor": 1,
+        "search.period.match": 1,
+    },
+    "pilco": {"search": Analytic(), "search.steps": Analytic.steps, "precision": "double"},
+}
+
+# What each section can be, by the kind that a stored config names.
+KINDS: dict[str, dict[str, Any]] = {
+    "model": {"bnn": BNN(), "gp": GP(), "ssgp": SSGP()},
+    "policy": {"mlp": MLP(), "rbf": RBF(), "linear": Linear()},
+    "fit": {"adam": Fit(), "lbfgs": LBFGS()},
+    "search": {"particles": Search(), "analytic": Analytic()},
+}

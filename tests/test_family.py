@@ -1,0 +1,138 @@
+"""Every model with every policy, matched or not, and analytically where there are moments: one loop serves them all."""
+
+import itertools
+from functools import cache, partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_jax import settings
+from pegasus_jax.build import compose, dynamics_of
+from pegasus_jax.cost import expected_saturating, saturating, widened
+from pegasus_jax.tasks import make
+from pegasus_jax.types import Trajectory
+from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
+from probes import same, unchecked
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+HORIZON, SEEDS = 3, 2
+WIDTH = 3.0  # [m], of the cost: it is flat nowhere that a model can imagine here
+UPRIGHT = np.array([0, 0, 0, np.pi])
+# What is small of each kind of section; a word counts only where the section has such a setting.
+SMALL = {
+    "model.hidden": "[8]",
+    "model.members": "2",
+    "model.features": "6",
+    "model.points": "4",
+    "policy.hidden": "[8]",
+    "policy.units": "5",
+    "fit.steps": "2",
+    "fit.starts": "2",
+    "search.steps": "2",
+    "search.particles": "6",
+    "trials": "3",
+}
+PIECES = [policy for policy in POLICIES if policy != "rbf100"]  # which is rbf with more units
+MOMENTS = [*itertools.product(("gp", "ssgp"), ("rbf", "linear"), ["analytic"])]
+FAMILY = [*itertools.product(MODELS, PIECES, ("matched", "kept")), *MOMENTS]
+
+
+class Counted:
+    """How often Python went through a function: once a trace."""
+
+    def __init__(self, function):
+        self.function, self.count = function, 0
+
+    def __call__(self, *arguments):
+        self.count += 1
+        return self.function(*arguments)
+
+
+def composed(model, policy, how):
+    """The member of the family on a cart-pole, and how often its model was traced."""
+    chosen = {"model": model, "policy": policy, **({"algorithm": "pilco"} if how == "analytic" else {})}
+    there = settings.leaves(settings.parse(chosen))
+    small = {key: value for key, value in SMALL.items() if key in there}
+    if model != "ensemble":
+        small.pop("model.members", None)
+    if how == "kept":
+        small |= {"search.match": "false", "search.cost": "particles", "search.widen": "1"}
+    config, task = settings.parse(chosen | small), make("cartpole")
+    error, angles = task.plant.error, task.angles
+    task = task._replace(
+        horizon=HORIZON,
+        start_mean=UPRIGHT,
+        start_std=np.full(4, 0.02),
+        cost=saturating(error, WIDTH),
+        expected_cost=expected_saturating(error, WIDTH, angles),
+        widened=partial(widened, error, WIDTH, angles),
+    )
+    dynamics = dynamics_of(config.model, task)
+    apply, moments = Counted(dynamics.apply), dynamics.moments and Counted(dynamics.moments)
+    traces = lambda: apply.count + (moments.count if moments else 0)  # noqa: E731
+    return compose(config, task, dynamics=dynamics._replace(apply=apply, moments=moments)), traces
+
+
+def episodes(trial):
+    """One for each seed, of nothing in particular, near the goal."""
+    keys = jax.random.split(jax.random.key(trial), 2)
+    x = UPRIGHT + 0.03 * jax.random.normal(keys[0], (SEEDS, HORIZON + 1, 4)).cumsum(1)
+    return Trajectory(x, 5 * jax.random.normal(keys[1], (SEEDS, HORIZON, 1)), jnp.ones((SEEDS, HORIZON)))
+
+
+@cache
+def fitted(model):
+    """A model's fit, compiled once for all policies: (state, episodes) -> state and report."""
+    exp, _ = composed(model, "mlp", "matched")
+    return unchecked(jax.jit(jax.vmap(lambda state, episode: exp.fit(exp.absorb(state, episode)))))
+
+
+def described(tree):
+    return jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype, getattr(leaf, "weak_type", False)), tree)
+
+
+@pytest.mark.parametrize(("model", "policy", "how"), FAMILY, ids=["-".join(member) for member in FAMILY])
+def test_member_of_the_family(model, policy, how):
+    """Three trials of two seeds: shapes and types kept, all finite, no update skipped, one trace, and repeatable."""
+    exp, traced = composed(model, policy, how)
+    search = unchecked(jax.jit(jax.vmap(exp.search)))
+    state = jax.jit(jax.vmap(exp.init))(jax.vmap(jax.random.key)(jnp.arange(SEEDS)))
+    traces = []
+    for trial in range(3):
+        # The policy waits outside: a model's fit does not know what kind it is.
+        learned, report = fitted(model)(state._replace(policy=None), episodes(trial))
+        before = learned._replace(policy=state.policy)
+        after, searched = search(before)
+        traces.append(traced())
+        assert described(after) == described(before) == described(state)
+        for leaf in jax.tree.leaves((after.model.params, after.policy.params, report, searched)):
+            assert np.all(np.isfinite(leaf))
+        assert not np.any(searched.skipped)
+        assert np.all(searched.gradient_norm > 0)
+        state = after
+    assert traces[0] > 0
+    assert len(set(traces)) == 1
+    again, repeated = search(before)
+    assert same(repeated.objective, searched.objective)
+    assert same(again.policy.params, state.policy.params)
+    assert any(not np.array_equal(leaf[0], leaf[1]) for leaf in jax.tree.leaves(state.policy.params))
+
+
+FIGURES = [
+    "model=ssgp policy=rbf algorithm=pilco",
+    *(f"model={model} policy=rbf" for model in ("binary", "log_normal")),
+    *(f"model={model} policy={policy}" for model in ("binary", "log_normal") for policy in ("mlp", "dropout_mlp")),
+    "model=concrete policy=dropout_mlp",
+]
+
+
+@pytest.mark.parametrize("words", FIGURES)
+def test_the_papers_combinations_are_members(words):
+    """Of its cart-pole figures; tests/test_train.py runs one of each kind of section as a user does."""
+    chosen = dict(word.split("=") for word in words.split())
+    how = "analytic" if chosen.get("algorithm") == "pilco" else "matched"
+    assert (chosen["model"], chosen["policy"], how) in FAMILY
+    assert {"paper", "pegasus", "deep_pilco", "pilco"} == {*ALGORITHMS}
