@@ -20,7 +20,6 @@ pegasus-train resume=RUN [trials=N]             go on with a run, also one that 
   algorithm=pegasus     how to search: {algorithms}
   out=runs/...          the run's folder (default: runs/TASK-seedN)
   seeds=1               so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN
-
   mesh=SEEDSxPARTICLES  the devices that share seeds and particles (default: as many as share the seeds evenly)
   distributed=true      started on several hosts at once by SLURM or MPI: their devices act as one machine; without
                         those, coordinator=HOST:PORT processes=N process=I on each. They share OUT on one file system
