@@ -59,7 +59,7 @@ def composed(model, policy, how):
     if model != "ensemble":
         small.pop("model.members", None)
     if how == "kept":
-        small |= {"search.match": "false", "search.cost": "particles", "search.widen": "1"}
+        small |= {"search.match": "false", "search.cost": "particles", "search.widen": "1", "search.restart": "false"}
     config, task = settings.parse(chosen | small), make("cartpole")
     error, angles = task.plant.error, task.angles
     task = task._replace(
