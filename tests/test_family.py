@@ -14,7 +14,7 @@ from pegasus_jax.cost import expected_saturating, saturating, widened
 from pegasus_jax.tasks import make
 from pegasus_jax.types import Trajectory
 from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
-from probes import same, unchecked
+from probes import Counter, same, unchecked
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
@@ -40,17 +40,6 @@ MOMENTS = [*itertools.product(("gp", "ssgp"), ("rbf", "linear"), ["analytic"])]
 FAMILY = [*itertools.product(MODELS, PIECES, ("matched", "kept")), *MOMENTS]
 
 
-class Counted:
-    """How often Python went through a function: once a trace."""
-
-    def __init__(self, function):
-        self.function, self.count = function, 0
-
-    def __call__(self, *arguments):
-        self.count += 1
-        return self.function(*arguments)
-
-
 def composed(model, policy, how):
     """The member of the family on a cart-pole, and how often its model was traced."""
     chosen = {"model": model, "policy": policy, **({"algorithm": "pilco"} if how == "analytic" else {})}
@@ -71,7 +60,7 @@ def composed(model, policy, how):
         widened=partial(widened, error, WIDTH, angles),
     )
     dynamics = dynamics_of(config.model, task)
-    apply, moments = Counted(dynamics.apply), dynamics.moments and Counted(dynamics.moments)
+    apply, moments = Counter(dynamics.apply), dynamics.moments and Counter(dynamics.moments)
     traces = lambda: apply.count + (moments.count if moments else 0)  # noqa: E731
     return compose(config, task, dynamics=dynamics._replace(apply=apply, moments=moments)), traces
 

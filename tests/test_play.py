@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -14,15 +11,10 @@ import pytest
 from pegasus_jax.report.play import HEIGHT, STRIP, WIDTH, composed, strip
 from pegasus_jax.tasks import make
 from pegasus_jax.types import Trajectory
+from test_train import call
 
 TINY = ["task=cartpole", "model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "trials=1"]
 TINY += ["search.particles=8"]
-
-
-def call(name: str, *words: object, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
-    program = [sys.executable, "-c", f"from pegasus_jax.cli import {name}; {name}()"]
-    command = [*program, *map(str, words)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, env={**os.environ, **env})
 
 
 @pytest.fixture(scope="module")

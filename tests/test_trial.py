@@ -11,23 +11,12 @@ from pegasus_jax.build import compose
 from pegasus_jax.config import Period
 from pegasus_jax.trial import COLLECT, EVALUATE, FIT, IMAGINE, RESTART, SEARCH, TrialInfo, run, trial_key
 from pegasus_jax.types import Policy, Prediction
-from probes import cart, dial, noisy_linear_policy, regression, same, tiny, unchecked
+from probes import Counter, cart, dial, noisy_linear_policy, regression, same, tiny, unchecked
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
 TRIALS, EPISODES = 3, 4
 QUICK = dict(trials=TRIALS, fit__steps=12, search__steps=6, search__particles=5)
-
-
-class Counter:
-    """How often Python went through a function: once a trace."""
-
-    def __init__(self, function):
-        self.function, self.count = function, 0
-
-    def __call__(self, *arguments):
-        self.count += 1
-        return self.function(*arguments)
 
 
 class Watched:
