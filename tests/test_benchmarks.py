@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import compare, timing
+from benchmarks import compare, scaling, timing
 from benchmarks.workloads import SIZES, flop, products, workload
 
 TINY = {"task": "cartpole", "search.particles": "20", "model.hidden": "[8,8]", "policy.hidden": "[7]"}
@@ -64,6 +64,19 @@ def test_a_workload_is_well_conditioned(work):
     assert 0.05 < value < 0.95
     assert np.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(gradient)])).all()
     assert set(SIZES) >= {"cart-pole", "double cart-pole"}
+
+
+@pytest.mark.parametrize(
+    ("line", "count"),
+    [
+        ("  %all-reduce.1 = f32[4,4]{1,0} all-reduce(%dot), to_apply=%add", 1),
+        ("  ROOT %r = (f32[4]{0}, f32[8]{0}) all-gather-start(%a, %b), channel_id=1", 1),
+        ("  %done = f32[4] all-reduce-done(%all-reduce-start.1)", 0),
+        ('  %f = f32[4] fusion(%all-reduce.1), kind=kLoop, metadata={op_name="a = b all-reduce"}', 0),
+    ],
+)
+def test_operations_between_devices_are_counted(line, count):
+    assert len(scaling.COLLECTIVE.findall(line)) == count
 
 
 @pytest.mark.parametrize("match", ["true", "false"])
