@@ -16,8 +16,8 @@ from pegasus_jax import cost as costs
 from pegasus_jax import lbfgs
 from pegasus_jax.gaussian import Image, chain, joint, residual, sincos
 from pegasus_jax.rollout import NoiseUse
-from pegasus_jax.search import SearchInfo
-from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Policy, Searcher
+from pegasus_jax.search import SearchInfo, at_first
+from pegasus_jax.types import Array, Begin, Dynamics, Key, Learner, Params, Policy, Searcher
 
 
 class Gaussians(NamedTuple):
@@ -115,12 +115,15 @@ def analytic(
     """
 
     def run(
-        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int
+        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, begin: Begin | None = None
     ) -> tuple[Learner, SearchInfo]:
         std = noise_std(key, belief)
 
         def value(params: Params) -> Array:
             return objective(params, belief, std)
+
+        if begin is not None:
+            learner = at_first(first, begin, learner, value)
 
         def idle(d: lbfgs.Descent) -> tuple[lbfgs.Descent, tuple[Array, Params]]:
             return d, (d.value, optax.tree.get(d.state, "grad"))
@@ -134,4 +137,4 @@ def analytic(
         after, (values, norms) = jax.lax.scan(iterate, descent, None, steps)
         return Learner(after.params, after), SearchInfo(values, norms, after.skipped - descent.skipped)
 
-    return Searcher(lbfgs.begin, run, lambda key, params, belief: objective(params, belief, noise_std(key, belief)))
+    return Searcher(lbfgs.begin, run)

@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
@@ -18,17 +19,22 @@ NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 
 
 class Jitted:
-    """A jitted function that says how long compiling took; compiles once, or it is a defect."""
+    """A jitted function that says how long its caller waited for compiling; compiles once, or it is a defect."""
 
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
+        self.coming: Future | None = None
 
     def __call__(self, *arguments: Any) -> Any:
         if self.compiled is None:
             began = time.monotonic()
-            self.compiled = self.function.lower(*arguments).compile()
+            self.compiled = self.coming.result() if self.coming else self.compile(*arguments)
             self.seconds = time.monotonic() - began
         return jax.block_until_ready(self.compiled(*arguments))
+
+    def compile(self, *arguments: Any) -> Any:
+        """The function compiled for arguments of these shapes."""
+        return self.function.lower(*arguments).compile()
 
 
 class Program:
@@ -38,7 +44,7 @@ class Program:
     """
 
     def __init__(self, experiment: Experiment, search_steps: int, seeds: int = 1, over: Mesh | None = None) -> None:
-        self.mesh = over
+        self.mesh, self.seeds = over, seeds
         self.chunk = chunk(search_steps)
         self.chunks = search_steps // self.chunk
         functions = {
@@ -59,12 +65,31 @@ class Program:
         }
         self.spent: dict[str, float] = {}
 
+    def prepare(self, part: str) -> None:
+        """Begin to compile a part, whose arguments are states and whole numbers, while other parts are at work."""
+        jitted = self.parts[part]
+        if jitted.compiled or jitted.coming:
+            return
+        keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), self.seeds))
+        states = self.parts["init"].function.eval_shape(keys)
+        arguments: tuple[Any, ...] = (states, *(jax.ShapeDtypeStruct((), jnp.int32) for _ in self.axes[part][1:]))
+        if self.mesh is not None:
+            arguments = self.laid_out(part, arguments, described)
+        worker = ThreadPoolExecutor(1)
+        jitted.coming = worker.submit(jitted.compile, *arguments)
+        worker.shutdown(wait=False)
+
+    def laid_out(self, part: str, arguments: tuple, lay: Callable[[Any, NamedSharding], Any]) -> tuple:
+        """A part's arguments on the mesh: those that all seeds share whole on every device, the others by seeds."""
+        assert self.mesh is not None
+        layouts = [mesh.shared(self.mesh) if a is None else mesh.over_seeds(self.mesh) for a in self.axes[part]]
+        return tuple(lay(*pair) for pair in zip(arguments, layouts, strict=True))
+
     def __call__(self, part: str, *arguments: Any, purpose: str | None = None) -> Any:
         """Run a part; its time is counted as that of `purpose`."""
         jitted, name = self.parts[part], purpose or part
         if self.mesh is not None:
-            layouts = [mesh.shared(self.mesh) if a is None else mesh.over_seeds(self.mesh) for a in self.axes[part]]
-            arguments = tuple(placed(*pair) for pair in zip(arguments, layouts, strict=True))
+            arguments = self.laid_out(part, arguments, placed)
         began, compiled = time.monotonic(), jitted.seconds
         result = jitted(*arguments)
         compiling = jitted.seconds - compiled
@@ -109,6 +134,11 @@ def placed(tree: Any, layout: NamedSharding) -> Any:
         return jax.device_put(np.asarray(leaf), layout)
 
     return jax.tree.map(put, tree)
+
+
+def described(tree: Any, layout: NamedSharding) -> Any:
+    """The shapes of a tree's arrays when they are laid out over devices."""
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=layout), tree)
 
 
 def fetched(tree: Any) -> Any:

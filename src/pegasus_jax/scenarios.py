@@ -63,11 +63,10 @@ def draw(key: Key, step: Array | int, belief: Params, *, blocks: Blocks, period:
     Block b at iteration i is drawn from fold_in(fold_in(key, b), i // period_b): any iteration's scenarios can be had
     without those before it, so a search may stop and go on anywhere.
     """
-
-    def one(block: int, sample: Callable, every: int) -> Params:
-        return sample(jax.random.fold_in(jax.random.fold_in(key, block), _epoch(step, every)), belief)
-
-    return Scenarios(*(one(i, *pair) for i, pair in enumerate(zip(blocks, period, strict=True))))
+    epochs = jnp.stack([_epoch(step, every) for every in period])
+    folded = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(blocks)))  # all at once: quick to compile
+    keys = jax.vmap(jax.random.fold_in)(folded, epochs)
+    return Scenarios(*(sample(keys[i], belief) for i, sample in enumerate(blocks)))
 
 
 def redraw(key: Key, step: Array, scenarios: Scenarios, belief: Params, *, blocks: Blocks, period: Period) -> Scenarios:

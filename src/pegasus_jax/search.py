@@ -12,7 +12,7 @@ from pegasus_jax import cost as costs
 from pegasus_jax.fit import guarded, skipped
 from pegasus_jax.rollout import NoiseUse, rollout
 from pegasus_jax.scenarios import Blocks, draw, redraw
-from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Period, Policy, Scenarios, Searcher
+from pegasus_jax.types import Array, Begin, Dynamics, Key, Learner, Params, Period, Policy, Scenarios, Searcher
 
 Schedule = Callable[[Array | int], Array]  # iteration -> a factor of the width of the cost
 
@@ -88,6 +88,7 @@ def optimise(
     steps: int,
     first: Array | int = 0,
     width: Schedule | None = None,
+    begin: Begin | None = None,
 ) -> tuple[Learner, SearchInfo]:
     """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 19).
 
@@ -96,7 +97,6 @@ def optimise(
     """
     first = jnp.asarray(first, jnp.int32)
     optimizer = optax.with_extra_args_support(optimizer)
-    before = skipped(learner.optimizer)
 
     def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], tuple[Array, Array]]:
         learner, scenarios = carry
@@ -109,8 +109,19 @@ def optimise(
         return (learner, scenarios), (value, optax.tree.norm(gradient))
 
     scenarios = draw(key, first, belief)
+    if begin is not None:
+        learner = at_first(first, begin, learner, lambda params: objective(params, belief, scenarios, *_at(width, 0)))
+    before = skipped(learner.optimizer)
     (learner, _), (values, norms) = jax.lax.scan(step, (learner, scenarios), first + jnp.arange(steps))
     return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
+
+
+def at_first(first: Array | int, begin: Begin, learner: Learner, value: Callable[[Params], Array]) -> Learner:
+    """What a search that goes on from iteration `first` starts from: of iteration 0, what `begin` makes of the learner.
+
+    `value` is the objective of iteration 0.
+    """
+    return jax.lax.cond(jnp.asarray(first) == 0, lambda old: begin(old, value), lambda old: old, learner)
 
 
 def narrowing(widest: float, over: float) -> Schedule:
@@ -142,11 +153,7 @@ def particles(
         optimizer=optimizer,
         width=width,
     )
-    return Searcher(
-        init=optimizer.init,
-        run=partial(optimise, **pieces),
-        value=lambda key, params, belief: objective(params, belief, pieces["draw"](key, 0, belief), *_at(width, 0)),
-    )
+    return Searcher(init=optimizer.init, run=partial(optimise, **pieces))
 
 
 def keeping_best(searcher: Searcher, last: int) -> Searcher:
@@ -156,11 +163,13 @@ def keeping_best(searcher: Searcher, last: int) -> Searcher:
     with redrawn scenarios each is noisy, so the lowest is partly luck, and not as good as it looks.
     """
 
-    def run(key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int) -> tuple[Learner, Any]:
+    def run(
+        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, begin: Begin | None = None
+    ) -> tuple[Learner, Any]:
         known = optax.tree.get(learner.optimizer, "best_value")
         known = jnp.where(jnp.asarray(first) == 0, jnp.inf, known)  # what an older model thought does not count
         learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, best_value=known))
-        learner, info = searcher.run(key, learner, belief, first=first, steps=steps)
+        learner, info = searcher.run(key, learner, belief, first=first, steps=steps, begin=begin)
         best = optax.tree.get(learner.optimizer, "best_params")
         kept = jax.tree.map(partial(jnp.where, first + steps >= last), best, learner.params)
         return learner._replace(params=kept), info

@@ -58,12 +58,14 @@ def train_seeds(
         program = Program(experiment, config.search.steps, len(seeds), mesh)
         display = Display(config.trials, 0, quiet=not leads())
         states = together(folders, replace(before, seed=0), display) if resume else None
+        done = display.done = 0 if states is None else int(states.trial[0])
+        if done < config.trials:
+            program.prepare("search")
         if states is None:
             states = program("init", jnp.stack([jax.random.key(seed) for seed in seeds]))
         room = config.trials * experiment.task.horizon
         if room > states.data.x.shape[1]:
             states = states._replace(data=jax.vmap(partial(grow, capacity=room))(states.data))
-        done = display.done = int(fetched(states.trial)[0])
         multihost_utils.sync_global_devices("every process has read what there is")
         boards = []
         for seed, run in runs.items() if leads() else ():
@@ -100,6 +102,7 @@ def one_trial(
     display.phase(trial, "fit", 0.02)
     states, fitted = fetched_info(program("fit", states))
     found = []
+    program.prepare("imagine")
     for i in range(program.chunks):
         cost = np.mean(found[-1].objective[:, -1]) if found else None
         display.phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)

@@ -112,25 +112,24 @@ def experiment(
         key = trial_key(state.key, state.trial, SEARCH)
         belief = dynamics.condition(state.model.params, state.data)
 
-        def begin(learner: Learner) -> Learner:
+        def begin(learner: Learner, value: Callable[[Params], Array]) -> Learner:
             """The learner of iteration 0, when the model is new."""
             params = learner.params
             if search_restart:
-                params = restarted(key, params, belief, policy.init(trial_key(state.key, state.trial, RESTART)))
+                params = restarted(params, policy.init(trial_key(state.key, state.trial, RESTART)), value)
             return Learner(params, search.init(params)) if search_reset else learner._replace(params=params)
 
-        learner = jax.lax.cond(jnp.asarray(first) == 0, begin, lambda learner: learner, state.policy)
-        learner, info = search.run(key, learner, belief, first=first, steps=steps)
+        learner, info = search.run(key, state.policy, belief, first=first, steps=steps, begin=begin)
         return state._replace(policy=learner), info
 
-    def restarted(key: Key, params: Params, belief: Params, fresh: Params) -> Params:
+    def restarted(params: Params, fresh: Params, value: Callable[[Params], Array]) -> Params:
         """`params`, or `fresh` when the new model expects no more of `params`.
 
         A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, so a policy
         that knows nothing is the better start. A tie goes to the fresh one; a model that imagines NaN changes nothing.
         """
         candidates = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, fresh)
-        kept, new = jax.vmap(search.value, (None, 0, None))(key, candidates, belief)
+        kept, new = jax.vmap(value)(candidates)
         return jax.tree.map(partial(jnp.where, new <= kept), fresh, params)
 
     def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:

@@ -152,12 +152,15 @@ class Fitter(NamedTuple):
     run: Callable[..., tuple[Learner, Any]]  # (key, learner, data, steps) -> (learner, FitInfo)
 
 
+# (learner, parameters -> the cost that iteration 0 sees) -> the learner that iteration 0 starts from
+Begin = Callable[[Learner, Callable[[Params], Array]], Learner]
+
+
 class Searcher(NamedTuple):
     """How a policy improves in imagination (Alg. 1 line 6)."""
 
     init: Callable[[Params], Any]  # parameters -> the optimiser's state
-    run: Callable[..., tuple[Learner, Any]]  # (key, learner, belief, first=, steps=) -> (learner, SearchInfo)
-    value: Callable[[Key, Params, Any], Array]  # (key, parameters, belief) -> the cost that iteration 0 of `run` sees
+    run: Callable[..., tuple[Learner, Any]]  # (key, learner, belief, first=, steps=, begin=) -> (learner, SearchInfo)
 
 
 class RunState(NamedTuple):
