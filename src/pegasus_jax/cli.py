@@ -5,6 +5,7 @@ import os
 import shlex
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,22 +75,22 @@ examples
 
 def train() -> None:
     """Entry point of pegasus-train."""
-    _main(_train, TRAIN)
+    main(_train, TRAIN)
 
 
 def evaluate() -> None:
     """Entry point of pegasus-eval."""
-    _main(_evaluate, EVALUATE)
+    main(_evaluate, EVALUATE)
 
 
 def plot() -> None:
     """Entry point of pegasus-plot."""
-    _main(_plot, PLOT)
+    main(_plot, PLOT)
 
 
 def play() -> None:
     """Entry point of pegasus-play."""
-    _main(_play, PLAY)
+    main(_play, PLAY)
 
 
 OPTIONS = ("out", "resume", "seeds", "mesh", "distributed", "coordinator", "processes", "process")  # of pegasus-train
@@ -110,7 +111,7 @@ def _train(words: Sequence[str]) -> None:
         runs = runs or {config.seed: home}
     else:
         config = tasks.pinned(settings.parse(rest, options=OPTIONS))
-        seeds = range(config.seed, config.seed + _whole("seeds", options.get("seeds", "1")))
+        seeds = range(config.seed, config.seed + whole("seeds", options.get("seeds", "1")))
         name = f"seed{seeds[0]}" if len(seeds) == 1 else f"seeds{seeds[0]}-{seeds[-1]}"
         home = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{tasks.label(config)}-{name}"))
         runs = {config.seed: home} if len(seeds) == 1 else {seed: home / f"seed{seed}" for seed in seeds}
@@ -122,7 +123,7 @@ def _train(words: Sequence[str]) -> None:
     from pegasus_jax.program import leads
 
     set_precision(config)
-    build(config)  # so that impossible settings end here, before anything is written
+    build(replace(config, seed=0), over)  # so that impossible settings end here, before anything is written
     if "resume" not in options and leads():
         if record.seeds_of(home):
             raise SettingError(f"out={home} holds runs already; resume={home} goes on, out={record.free(home)} is free")
@@ -148,7 +149,7 @@ def _join(options: dict[str, str]) -> None:
         raise SettingError(f"distributed={options['distributed']} is neither true nor false")
     try:
         if given:
-            count, index = (_whole(name, options[name]) for name in ("processes", "process"))
+            count, index = (whole(name, options[name]) for name in ("processes", "process"))
             jax.distributed.initialize(options["coordinator"], count, index)
         else:
             jax.distributed.initialize()  # SLURM, Open MPI and others say where the coordinator is
@@ -181,7 +182,7 @@ def _mesh(text: str | None, seeds: int) -> Any:
 
 def _evaluate(words: Sequence[str]) -> None:
     run, rest = _run_and(words, {"episodes": "20", "seed": "0", "json": "false"})
-    episodes, seed = (_whole(name, rest[name]) for name in ("episodes", "seed"))
+    episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     if rest["json"] not in ("true", "false"):
         raise SettingError(f"json={rest['json']} is neither true nor false")
     from pegasus_jax.train import evaluate_run
@@ -209,7 +210,7 @@ def _plot(words: Sequence[str]) -> None:
 
 def _play(words: Sequence[str]) -> None:
     run, rest = _run_and(words, {"episodes": "1", "seed": "0"})
-    episodes, seed = (_whole(name, rest[name]) for name in ("episodes", "seed"))
+    episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     from pegasus_jax.report.play import film
 
     print(film(run, episodes, seed))
@@ -237,8 +238,9 @@ def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False)
     return record.existing(path), defaults | rest
 
 
-def _whole(name: str, text: str) -> int:
-    if not text.isdecimal() or (name in ("episodes", "seeds") and int(text) < 1):
+def whole(name: str, text: str) -> int:
+    """The whole number of an option. Raises SettingError when it is none, or 0 where nothing would be done."""
+    if not text.isdecimal() or (name in ("episodes", "seeds", "jobs") and int(text) < 1):
         raise SettingError(f"{name}={text} is not a whole number; for example {name}=20")
     return int(text)
 
@@ -262,7 +264,7 @@ def _help(text: str) -> str:
     return text.format(settings="\n".join(settings.help_lines(Config())), others="".join(others), **lists)
 
 
-def _main(command: Callable[[Sequence[str]], None], text: str) -> None:
+def main(command: Callable[[Sequence[str]], None], text: str) -> None:
     """Run a command: 0 done, 1 stopped by its user, 2 a setting or a run's folder that cannot be, in one line."""
     words = sys.argv[1:]
     if not words or {"-h", "--help", "help"} & {*words}:

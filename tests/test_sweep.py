@@ -1,0 +1,120 @@
+"""pegasus-sweep: every combination once, each checked before anything starts, each an ordinary run in the end."""
+
+import itertools
+import shlex
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pegasus_jax import record, settings
+from pegasus_jax.config import SettingError
+from pegasus_jax.sweep import check, handle, jobs_of, values
+from test_train import TINY
+
+PROGRAM = [sys.executable, "-c", "from pegasus_jax.sweep import sweep; sweep()"]
+
+
+def call(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([*PROGRAM, *words], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("3", ["3"]),
+        ("1,10,100", ["1", "10", "100"]),
+        ("0-3", ["0", "1", "2", "3"]),
+        ("0-2,7", ["0", "1", "2", "7"]),
+        ("[50,50]", ["[50,50]"]),
+        ("[50,50],[200]", ["[50,50]", "[200]"]),
+        ("1e-3,2e-3", ["1e-3", "2e-3"]),
+        ("Pendulum-v1", ["Pendulum-v1"]),
+        ("3-1", []),
+    ],
+)
+def test_values(text: str, found: list[str]) -> None:
+    assert values(text) == found
+
+
+lists = st.lists(st.integers(0, 99), max_size=3).map(lambda found: f"[{','.join(map(str, found))}]")
+
+
+@given(st.lists(lists | st.integers(0, 10**6).map(str), min_size=1, max_size=5, unique=True))
+def test_what_is_joined_by_commas_is_split_there(found: list[str]) -> None:
+    assert values(",".join(found)) == found
+
+
+def test_every_combination_has_its_own_run() -> None:
+    words = {"task": "cartpole", "search.clip": "1,10", "policy.hidden": "[5,5],[7]", "seed": "0-1"}
+    jobs = jobs_of(words, Path("out"))
+    told = [settings.split(job.words, ("out",)) for job in jobs]
+    assert [options["out"] for options, _ in told] == [str(job.run) for job in jobs]
+    assert len({job.run for job in jobs}) == 8
+    combinations = itertools.product(("1", "10"), ("[5,5]", "[7]"), ("0", "1"))
+    assert [tuple(chosen.values())[1:] for _, chosen in told] == list(combinations)
+    assert jobs[1].run == Path("out/search.clip-1_policy.hidden-5-5/seed1")
+
+
+def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
+    """So that pegasus-plot draws them together."""
+    jobs = jobs_of({"task": "cartpole", "seed": "3-5"}, tmp_path)
+    for job in jobs:
+        job.run.mkdir()
+        (job.run / "config.yaml").touch()
+    assert record.seeds_of(tmp_path) == dict(zip((3, 4, 5), (job.run for job in jobs), strict=True))
+    with pytest.raises(SettingError, match="holds a run already"):
+        check(jobs[0])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["seed=0,0"], "give each value once"),
+        (["seed=0,"], "empty value"),
+        (["seed=4-2"], "seed=0-2"),
+        (["search.clip=1,x"], "search.clip=x is not a number"),
+        (["search.particles=3,100"], "search.particles=3 is too few"),
+        (["search.clip=1", "clipp=2"], "clipp is not a setting"),
+        (["seeds=1,2"], "seeds=1,2 is not a whole number"),
+        (["jobs=0"], "jobs=0 is not a whole number"),
+        (["launcher=slrm"], "did you mean 'slurm'"),
+        (["launcher=slurm"], "launcher="),  # neither the extra nor SLURM, or only one of them
+    ],
+)
+def test_what_cannot_be_is_said_before_anything_starts(words: list[str], message: str, tmp_path: Path) -> None:
+    with pytest.raises(SettingError, match=message) as said:
+        handle(["task=cartpole", *words, f"out={tmp_path / 'sweep'}"])
+    assert "\n" not in str(said.value)
+    assert not list(tmp_path.rglob("config.yaml"))
+
+
+def test_a_mistake_is_one_line(tmp_path: Path) -> None:
+    done = call("task=cartpole", "search.clip=1,x", "launcher=local", cwd=tmp_path)
+    assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_printed_commands_are_those_of_the_runs(tmp_path: Path) -> None:
+    done = call("task=cartpole", "policy.hidden=[5,5],[7]", "seeds=2", "out=my runs", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert [shlex.split(line) for line in done.stdout.splitlines()] == [
+        ["pegasus-train", "task=cartpole", f"policy.hidden={value}", "seeds=2", f"out=my runs/policy.hidden-{name}"]
+        for value, name in (("[5,5]", "5-5"), ("[7]", "7"))
+    ]
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(find_spec("submitit") is None, reason="the extra `sweep` is not installed")
+def test_a_sweep_on_this_machine_leaves_ordinary_runs(tmp_path: Path) -> None:
+    done = call(*TINY, "trials=1", "seed=1,2", "jobs=1", "launcher=local", "out=sweep", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("done: ") == 2
+    for seed in (1, 2):
+        run = tmp_path / "sweep" / f"seed{seed}"
+        assert [row["trial"] for row in record.trials(run)] == [1]
+        assert settings.load(run / "config.yaml").seed == seed
