@@ -1,9 +1,12 @@
 """Our search step and plain PyTorch's, in turn in one process, once they agree on the objective and its gradient.
 
     taskset -c 0 python -m benchmarks.peers.compare [sizes=cart-pole,...] [repeats=5] [compile=true] [setting=value ...]
+        [prob_mbrl=CHECKOUT]
 
 Needs the extra `peers`. Pin it to as many CPUs as you ask `threads=` for: nothing else holds XLA to one. `compile=true`
 adds torch.compile of a time step, tuned by hand (a C++ compiler and a minute are needed). Sizes are in `workloads`.
+`prob_mbrl=` adds the authors' PyTorch code, its search step and its fit step, where you have a clone of
+github.com/mcgillmrl/prob_mbrl and `pip install tqdm joblib`: see `of_prob_mbrl`, also for what agrees and what differs.
 """
 
 import json
@@ -20,14 +23,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.peers import plain_torch
+from benchmarks.peers import of_prob_mbrl, plain_torch
 from benchmarks.timing import compiled, in_turn, own_products, summary
 from benchmarks.workloads import SIZES, Workload, goal, workload
 from pegasus_jax import settings
 from pegasus_jax.record import about
 
 RESULTS = Path(__file__).parents[1] / "results"
-STEPS = 10  # search steps in one timed run
+STEPS, FIT_STEPS = 10, 100  # in one timed run
 
 
 def tensor(array: Any) -> Tensor:
@@ -80,7 +83,7 @@ def disagreement(work: Workload, problem: plain_torch.Problem, one: Callable) ->
     return abs(float(ours) - theirs.item()), float(difference / size)
 
 
-def compare(work: Workload, repeats: int, tuned: bool) -> dict[str, Any]:
+def compare(work: Workload, repeats: int, tuned: bool, prob_mbrl: Any = None) -> dict[str, Any]:
     """Milliseconds of a search step of each, and what the programs disagree by. RuntimeError if it is too much."""
     problem, particles = problem_of(work), work.config.search.particles
     versions: dict[str, Callable] = {"eager": plain_torch.step}
@@ -97,23 +100,35 @@ def compare(work: Workload, repeats: int, tuned: bool) -> dict[str, Any]:
     for name, one in versions.items():
         search = plain_torch.searcher(problem, policy, particles, work.config.search.learning_rate, one)
         programs[name] = lambda search=search: [search() for _ in range(STEPS)]
+    if prob_mbrl is not None:
+        found = of_prob_mbrl.disagreement(prob_mbrl, work, layers_of, tensor)
+        row |= {f"prob_mbrl_{name}_difference": value for name, value in found.items()}
+        if found["objective"] > 1e-5:
+            raise RuntimeError(f"prob_mbrl: the objectives differ by {found['objective']:.1e}")
+        theirs = of_prob_mbrl.programs(prob_mbrl, work, layers_of, tensor, STEPS, FIT_STEPS)
+        fit, _ = compiled(partial(work.experiment.fit, steps=FIT_STEPS), work.state)
+        fits = in_turn({"ours": fit, "prob_mbrl": theirs["fit"]}, repeats)
+        row |= {f"{name}_fit_ms": summary(runs, FIT_STEPS)["min_ms"] for name, runs in fits.items()}
+        row["ours_of_prob_mbrl_fit"] = row["ours_fit_ms"] / row["prob_mbrl_fit_ms"]
+        programs["prob_mbrl"] = theirs["search"]
     times = in_turn(programs, repeats)
     row |= {f"{name}_ms": summary(runs, STEPS)["min_ms"] for name, runs in times.items()}
-    row |= {f"ours_of_{name}": row["ours_ms"] / row[f"{name}_ms"] for name in versions}
+    row |= {f"ours_of_{name}": row["ours_ms"] / row[f"{name}_ms"] for name in programs if name != "ours"}
     row["ours_of_own_products"] = row["ours_ms"] / own_products(work, repeats)
     return row
 
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, dotted = settings.split(words, ("sizes", "repeats", "compile", "threads"))
+    options, dotted = settings.split(words, ("sizes", "repeats", "compile", "threads", "prob_mbrl"))
+    prob_mbrl = of_prob_mbrl.load(Path(options["prob_mbrl"])) if "prob_mbrl" in options else None
     torch.set_num_threads(int(options.get("threads", "1")))
     names = options["sizes"].split(",") if "sizes" in options else list(SIZES)
     rows = {}
     for name in names:
-        rows[name] = compare(
-            workload({**SIZES[name], **dotted}), int(options.get("repeats", "5")), options.get("compile") == "true"
-        )
+        work = workload({**SIZES[name], **dotted})
+        tuned, repeats = options.get("compile") == "true", int(options.get("repeats", "5"))
+        rows[name] = compare(work, repeats, tuned, prob_mbrl)
         print(name, json.dumps({key: float(f"{value:.3g}") for key, value in rows[name].items()}), flush=True)
     command = shlex.join(["python", "-m", "benchmarks.peers.compare", *words])
     result = {"rows": rows, "torch": torch.__version__, "about": about(command)}
