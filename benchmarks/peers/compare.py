@@ -1,7 +1,7 @@
 """Our search step and plain PyTorch's, in turn in one process, once they agree on the objective and its gradient.
 
     taskset -c 0 python -m benchmarks.peers.compare [sizes=cart-pole,...] [repeats=5] [compile=true] [setting=value ...]
-        [prob_mbrl=CHECKOUT]
+        [prob_mbrl=CHECKOUT] [out=benchmarks/results/peers.json]
 
 Needs the extra `peers`. Pin it to as many CPUs as you ask `threads=` for: nothing else holds XLA to one. `compile=true`
 adds torch.compile of a time step, tuned by hand (a C++ compiler and a minute are needed). Sizes are in `workloads`.
@@ -120,7 +120,7 @@ def compare(work: Workload, repeats: int, tuned: bool, prob_mbrl: Any = None) ->
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, dotted = settings.split(words, ("sizes", "repeats", "compile", "threads", "prob_mbrl"))
+    options, dotted = settings.split(words, ("sizes", "repeats", "compile", "threads", "prob_mbrl", "out"))
     prob_mbrl = of_prob_mbrl.load(Path(options["prob_mbrl"])) if "prob_mbrl" in options else None
     torch.set_num_threads(int(options.get("threads", "1")))
     names = options["sizes"].split(",") if "sizes" in options else list(SIZES)
@@ -132,7 +132,7 @@ def main(words: list[str]) -> None:
         print(name, json.dumps({key: float(f"{value:.3g}") for key, value in rows[name].items()}), flush=True)
     command = shlex.join(["python", "-m", "benchmarks.peers.compare", *words])
     result = {"rows": rows, "torch": torch.__version__, "about": about(command)}
-    (RESULTS / "peers.json").write_text(json.dumps(result, indent=1) + "\n")
+    Path(options.get("out", RESULTS / "peers.json")).write_text(json.dumps(result, indent=1) + "\n")
 
 
 if __name__ == "__main__":
