@@ -2,7 +2,7 @@
 
     python -m benchmarks.results_page
 
-Run it again when a study has been added; only what is between the page's two markers is written.
+Run it again when a study has been added: it draws the figures' pictures, and writes what is between the page's markers.
 """
 
 import json
@@ -11,7 +11,7 @@ from pathlib import Path
 
 from benchmarks.study import RESULTS
 from pegasus_jax.report import claims
-from pegasus_jax.report.comparison import stored
+from pegasus_jax.report.comparison import draw, results, stored
 from pegasus_jax.report.figures import Figure, read
 
 FIGURES = Path(__file__).parent / "figures"
@@ -21,7 +21,11 @@ BEGIN, END = "<!-- generated: python -m benchmarks.results_page -->\n", "<!-- ge
 
 
 def main() -> None:
-    """Write the page's generated part."""
+    """Draw every figure that has studies, and write the page's generated part."""
+    for path in FIGURES.glob("*.toml"):
+        figure = read(path)
+        if there := results(figure, RESULTS):
+            draw(figure, there, RESULTS)
     before, _, rest = PAGE.read_text().partition(BEGIN)
     PAGE.write_text(before + BEGIN + generated(FIGURES, RESULTS) + END + rest.partition(END)[2])
 

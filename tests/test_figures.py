@@ -261,6 +261,23 @@ def test_the_page_tells_what_was_run_from_what_was_not(tmp_path):
         assert len({line.count("|") for line in table.splitlines()}) == 1
 
 
+def test_refreshing_the_page_keeps_what_a_person_wrote(tmp_path, monkeypatch):
+    (tmp_path / "mine.toml").write_text(TINY)
+    write_study(tmp_path, "mine-loose", np.random.default_rng(0).uniform(size=(5, 2)))
+    page = tmp_path / "results.md"
+    page.write_text(f"before\n{results_page.BEGIN}old{results_page.END}after\n")
+    for name, value in dict(FIGURES=tmp_path, RESULTS=tmp_path, PAGE=page).items():
+        monkeypatch.setattr(results_page, name, value)
+    results_page.main()
+    once = page.read_text()
+    assert once.startswith("before\n")
+    assert once.endswith("after\n")
+    assert "\nold" not in once
+    assert "](mine.png)" in once  # drawn, and shown
+    results_page.main()
+    assert page.read_text() == once
+
+
 def test_the_published_page_has_its_markers():
     text = results_page.PAGE.read_text()
     assert text.count(results_page.BEGIN) == text.count(results_page.END) == 1

@@ -2,14 +2,16 @@
 
 import json
 import shlex
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from pegasus_jax import settings
-from pegasus_jax.build import build, set_precision
+from pegasus_jax.build import build
 from pegasus_jax.config import Config, SettingError, nearest
 from pegasus_jax.record import RunError, about
 from pegasus_jax.report.curves import areas_picture, picture
@@ -31,8 +33,8 @@ def configs(figure: Figure, changes: Sequence[str] = ()) -> dict[str, Config]:
         try:
             words = [f"trials={figure.trials}", *shlex.split(figure.common), *shlex.split(own), *changes]
             config = settings.parse(settings.split(words)[1], options=OPTIONS)
-            set_precision(config)
-            build(config)  # so that impossible settings end here, before an hour's work
+            with jax.enable_x64(config.precision == "double"):
+                build(config)  # so that impossible settings end here, before an hour's work
         except ValueError as error:  # a SettingError is one
             raise SettingError(f"figure {figure.name}, variant {label}: {error}") from error
         found[label] = config
@@ -57,6 +59,7 @@ def run(
     for label in only or figure.variants:
         if stored(out, f"{figure.name}-{label}") is None:
             path = out / f"{figure.name}-{label}.json"
+            print(f"{path}: {len(chosen)} seeds, {wanted[label].trials} trials", file=sys.stderr, flush=True)
             write(path, study(wanted[label], chosen, path) | {"about": about(command)})
     return results(figure, out)
 
