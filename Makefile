@@ -44,7 +44,7 @@ bench-compare: $(STAMP) ## measure speed again and fail if it is below .77 of th
 	$(BIN)/python -m benchmarks.compare $(VENV)/speed.json
 
 figures: $(STAMP) ## run one of the paper's experiments: make figures FIGURE=crn
-	$(BIN)/python -m benchmarks.figures $(FIGURE) $(ARGS)
+	$(BIN)/pegasus-figures benchmarks/figures/$(FIGURE).toml out=benchmarks/results $(ARGS)
 
 docs: $(STAMP) ## draw the pictures of README.md and docs/ again
 	$(BIN)/python -m benchmarks.pictures $(ARGS)

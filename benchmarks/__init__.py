@@ -1,1 +1,1 @@
-"""Measurements: speed (suite), learning (study, figures), pictures for the documentation."""
+"""Measurements: speed (suite), learning (study; figures/ is for pegasus-figures), pictures for the documentation."""

@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
     0: "types config variants",
-    1: "angles mesh dropout whiten moments gaussian cost dataset scenarios rollout episode",
+    1: "angles mesh dropout whiten moments gaussian cost dataset scenarios rollout episode calibration",
     2: "network kernel fit lbfgs search pilco",
     3: "dynamics. policy. trial",
     4: "tasks",
@@ -28,6 +28,7 @@ TOP = max(LAYERS)  # the layer that is an application: here modules may import e
 SIBLINGS: set[tuple[str, str]] = {
     ("variants", "config"),  # a variant is made of settings
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
+    ("calibration", "angles"),  # an error of 359 degrees is one of 1
     ("cost", "gaussian"),  # the expected cost of a Gaussian state
     ("cost", "moments"),  # of the Gaussian with the particles' mean and covariance
     ("scenarios", "mesh"),  # where the particles that it draws lie

@@ -62,7 +62,7 @@ def test_wheel_holds_nothing_else(wheel: zipfile.ZipFile) -> None:
 def test_wheel_has_the_commands(wheel: zipfile.ZipFile) -> None:
     (path,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
     text = wheel.read(path).decode()
-    for command in ("pegasus-train", "pegasus-eval", "pegasus-plot"):
+    for command in ("pegasus-train", "pegasus-eval", "pegasus-plot", "pegasus-play", "pegasus-figures"):
         assert f"{command} = pegasus_jax.cli:" in text
 
 

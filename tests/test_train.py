@@ -67,6 +67,8 @@ def test_a_run_leaves_everything(whole: Path) -> None:
         for name in ("fit_loss", "objective_first", "objective_last", "objective_fresh", "gradient_norm"):
             assert np.isfinite(row[name]), name
         assert row["skipped_updates"] == 0
+    assert rows[0]["calibration"] is None  # there was no model yet
+    assert all(row["calibration"] > 0 for row in rows[1:])
     assert sum(row["seconds"]["compile"] for row in rows[1:]) == 0  # nothing recompiles from trial to trial
     assert list((whole / "tensorboard").glob("events*"))
     about = json.loads((whole / "run.json").read_text())

@@ -1,4 +1,4 @@
-"""The commands: pegasus-train, -eval, -plot and -play. Each reads `key=value` words and ends with 0, 1 or 2."""
+"""The commands: pegasus-train, -eval, -plot, -play, -figures. Each reads `key=value` words and ends with 0, 1 or 2."""
 
 import json
 import os
@@ -72,6 +72,31 @@ examples
   pegasus-play runs/cartpole-seed0 episodes=5 seed=1
 """
 
+FIGURES = """\
+pegasus-figures FILE [out=runs/figures] [seeds=0-9] [variants=A,B] [setting=value ...]     compare learning curves
+
+FILE is TOML and says what varies, over which seeds and how many trials. Each variant is one vmapped program of all its
+seeds and leaves OUT/NAME-VARIANT.json, written after every trial; one that is there already is not run again. Then
+draws OUT/NAME.png (every seed thin, the interquartile mean thick with its 95 % bootstrap interval) and prints what came
+out, and what that says to the file's claims.
+
+  out=runs/figures      the folder of the studies; NAME is FILE without .toml
+  seeds=0-9             instead of the file's; or seeds=0,3,7
+  variants=A,B          run only these; all that are there are drawn
+  setting=value         in every variant, instead of the file's; pegasus-train --help lists settings
+
+a file
+  title = "How wide a policy?"
+  trials = 15
+  common = "task=cartpole algorithm=pegasus"
+  [variants]
+  narrow = "policy.hidden=[50,50]"
+  wide = "policy.hidden=[200,200]"
+
+With picture = "area", the area under each learning curve, a dot a seed. The paper's own are in benchmarks/figures/.
+On two CPU cores a variant of ten seeds takes most of an hour, on one GPU a minute or two.
+"""
+
 
 def train() -> None:
     """Entry point of pegasus-train."""
@@ -91,6 +116,11 @@ def plot() -> None:
 def play() -> None:
     """Entry point of pegasus-play."""
     main(_play, PLAY)
+
+
+def figures() -> None:
+    """Entry point of pegasus-figures."""
+    main(_figures, FIGURES, stopped="finished variants are kept, the same command goes on")
 
 
 OPTIONS = ("out", "resume", "seeds", "mesh", "distributed", "coordinator", "processes", "process")  # of pegasus-train
@@ -216,6 +246,27 @@ def _play(words: Sequence[str]) -> None:
     print(film(run, episodes, seed))
 
 
+def _figures(words: Sequence[str]) -> None:
+    from pegasus_jax import settings
+    from pegasus_jax.report import claims, comparison
+    from pegasus_jax.report.figures import read
+
+    files = [word for word in words if "=" not in word]
+    if len(files) != 1:
+        raise SettingError(f"name one file, not {len(files)}; for example benchmarks/figures/crn.toml")
+    options, changed = settings.split([word for word in words if "=" in word], comparison.OPTIONS)
+    asked: dict[str, Any] = dict(seeds=options.get("seeds", ""), changes=[f"{k}={v}" for k, v in changed.items()])
+    only = [label for label in options.get("variants", "").split(",") if label]
+    figure, out = read(Path(files[0])), Path(options.get("out", "runs/figures"))
+    there = comparison.run(figure, out, only=only, command=shlex.join(["pegasus-figures", *words]), **asked)
+    for line in comparison.differences(figure, there, **asked):
+        print(line, file=sys.stderr)
+    print(claims.markdown(claims.variants_table(figure, out)))
+    if figure.claims:
+        print(f"\n{claims.markdown(claims.claims_table(figure, out))}")
+    print(comparison.draw(figure, there, out))
+
+
 def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False) -> tuple[Path, dict[str, str]]:
     """The run's folder, or with `many` maybe that of several seeds, and the options of a command that reads it."""
     from pegasus_jax import record, settings
@@ -264,7 +315,11 @@ def _help(text: str) -> str:
     return text.format(settings="\n".join(settings.help_lines(Config())), others="".join(others), **lists)
 
 
-def main(command: Callable[[Sequence[str]], None], text: str) -> None:
+def main(
+    command: Callable[[Sequence[str]], None],
+    text: str,
+    stopped: str = "every finished episode is kept, resume=RUN goes on",
+) -> None:
     """Run a command: 0 done, 1 stopped by its user, 2 a setting or a run's folder that cannot be, in one line."""
     words = sys.argv[1:]
     if not words or {"-h", "--help", "help"} & {*words}:
@@ -279,7 +334,7 @@ def main(command: Callable[[Sequence[str]], None], text: str) -> None:
         print(f"pegasus: {error}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
-        print("stopped; every finished episode is kept, resume=RUN goes on", file=sys.stderr)
+        print(f"stopped; {stopped}", file=sys.stderr)
         sys.exit(1)
 
 

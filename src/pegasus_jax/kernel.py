@@ -4,8 +4,9 @@ Everything here is in scaled units: inputs and targets have zero mean and unit v
 length scale of 1 is the standard deviation of the data.
 """
 
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable
+from functools import partial, wraps
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from jax.scipy.linalg import solve_triangular
 
 from pegasus_jax import gaussian
 from pegasus_jax.angles import encode
-from pegasus_jax.types import Array, Dataset, Params
+from pegasus_jax.types import Array, Dataset, Dynamics, Params
 from pegasus_jax.whiten import Whitener, whiten, whitener
 
 
@@ -127,6 +128,20 @@ def _(axis_size: int, in_batched: list[bool], matrices: Array) -> tuple[Array, b
     del axis_size, in_batched
     whole = jax.vmap(inverse_root.fun)
     return jax.lax.platform_dependent(matrices, cpu=partial(jax.lax.map, inverse_root), default=whole), True
+
+
+def precise(dynamics: Dynamics) -> Dynamics:
+    """A model that has moments, with products in full precision: a GPU's usual 10 bits are too few here."""
+
+    def exact(function: Any) -> Callable[..., Any]:
+        @wraps(function)
+        def call(*arguments: Any) -> Any:
+            with jax.default_matmul_precision("highest"):
+                return function(*arguments)
+
+        return call
+
+    return Dynamics(*(exact(function) for function in dynamics))
 
 
 def in_raw_units(process: gaussian.Map, scaling: Scaling) -> gaussian.Map:

@@ -54,6 +54,7 @@ class Program:
             "fit": (experiment.fit, (0,)),
             "search": (partial(experiment.search, steps=self.chunk), (0, None)),
             "imagine": (experiment.imagine, (0,)),
+            "calibrate": (experiment.calibrate, (0, 0)),
         }
         self.axes = {name: axes for name, (_, axes) in functions.items()}
         self.parts = {

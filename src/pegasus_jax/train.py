@@ -98,7 +98,9 @@ def one_trial(
     task = experiment.task
     display.phase(trial, "collect")
     episodes = collected(states, trial, config, runs, task, program)
-    states = program("absorb", states, jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes))
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes)
+    calibration = fetched(program("calibrate", states, stacked))  # before this episode teaches the model
+    states = program("absorb", states, stacked)
     display.phase(trial, "fit", 0.02)
     states, fitted = fetched_info(program("fit", states))
     found = []
@@ -130,7 +132,8 @@ def one_trial(
             "objective_fresh": float(jnp.mean(imagined_cost[index])),
             "gradient_norm": float(np.median(norm[index])),
             "skipped_updates": int(skipped[index]),
-            "saturated": saturated(episode, task),
+            "saturated": float(saturated(episode.u, task)),
+            "calibration": known(calibration[index]),
             "seconds": seconds,
         }
         for index, episode in enumerate(episodes)
@@ -169,12 +172,17 @@ def evaluate(
     ]
 
 
-def saturated(episode: Trajectory, task: Task) -> float:
-    """Fraction of an episode's controls within 1 % of a limit."""
+def saturated(u: Any, task: Task) -> np.ndarray:
+    """Fraction of the controls [..., H, U] of episodes that are within 1 % of a limit [...]."""
     low, high = np.asarray(task.control_low), np.asarray(task.control_high)
     margin = 0.01 * (high - low)
-    u = np.asarray(episode.u)
-    return float(np.mean((u < low + margin) | (u > high - margin)))
+    u = np.asarray(u)
+    return np.mean((u < low + margin) | (u > high - margin), axis=(-2, -1))
+
+
+def known(value: Any) -> float | None:
+    """A number, or None for one that is not known: JSON has no NaN."""
+    return None if np.isnan(value) else float(value)
 
 
 def fetched_info(result: tuple[RunState, Any]) -> tuple[RunState, Any]:
@@ -230,13 +238,15 @@ def scalars(board: SummaryWriter, row: dict[str, Any]) -> None:
 
 
 def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
-    """A trial in one line; the means over the seeds, when there are several."""
+    """A trial in one line; over several seeds the means, and the median calibration."""
     mean = {name: np.mean([row[name] for row in rows]) for name in ("mean_cost", "success_rate", "objective_last")}
     first, skipped = rows[0], sum(row["skipped_updates"] for row in rows)
     solved = sum(row["success_rate"] >= 0.9 for row in rows)
+    errors = [row["calibration"] for row in rows if row["calibration"] is not None]
     return (
         f"trial {first['trial']:>2}/{trials}  {first['plant_seconds']:6.1f} s of plant  cost {mean['mean_cost']:.3f}"
         f"  success {mean['success_rate']:4.0%}  imagined {mean['objective_last']:.3f}"
+        + (f"  calibration {np.median(errors):.1f}" if errors else "")
         + (f"  {solved} of {len(rows)} seeds solved" if len(rows) > 1 else "")
         + f"  ({sum(first['seconds'].values()):.0f} s, {first['seconds']['compile']:.0f} s of it compiling)"
         + (f"  {skipped} updates skipped" if skipped else "")

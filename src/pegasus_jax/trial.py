@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from pegasus_jax import dataset, episode
+from pegasus_jax.calibration import calibration
 from pegasus_jax.fit import FitInfo
 from pegasus_jax.search import SearchInfo
 from pegasus_jax.types import (
@@ -27,7 +28,7 @@ from pegasus_jax.types import (
 )
 
 # What the key of a trial is folded with, so that no two draws share a key.
-COLLECT, FIT, SEARCH, IMAGINE, EVALUATE, RESTART = range(6)
+COLLECT, FIT, SEARCH, IMAGINE, EVALUATE, RESTART, CALIBRATE = range(7)
 
 
 class TrialInfo(NamedTuple):
@@ -142,8 +143,29 @@ def experiment(
         belief = dynamics.condition(state.model.params, state.data)
         return imagine(trial_key(state.key, state.trial, IMAGINE), state.policy.params, belief)
 
+    def calibrate(state: RunState, trajectory: Trajectory) -> Array:
+        """`calibration` of the model as it is, on the next episode before it is absorbed; NaN while there are no data.
+
+        With a key of its own, so that asking changes nothing.
+        """
+        belief = dynamics.condition(state.model.params, state.data)
+        key = trial_key(state.key, state.trial + 1, CALIBRATE)
+        found = calibration(key, belief, trajectory, dynamics=dynamics, angles=task.angles)
+        return jnp.where(state.data.size > 0, found, jnp.nan)
+
     return Experiment(
-        task, dynamics, policy, init, one_episode, collect, absorb, learn, improve_policy, improve, look_ahead
+        task,
+        dynamics,
+        policy,
+        init,
+        one_episode,
+        collect,
+        absorb,
+        learn,
+        improve_policy,
+        improve,
+        look_ahead,
+        calibrate,
     )
 
 

@@ -187,3 +187,4 @@ class Experiment(NamedTuple):
     search: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 6
     improve: Callable[[RunState], tuple[RunState, Any]]  # search after fit
     imagine: Callable[[RunState], tuple[Rollout, Array]]  # fresh scenarios -> (rollout, cost [H, K])
+    calibrate: Callable[[RunState, Trajectory], Array]  # of the model, on an episode not yet absorbed -> calibration

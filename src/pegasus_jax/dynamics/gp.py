@@ -77,8 +77,9 @@ def gp(*, states: int, controls: int, angles: tuple[int, ...], features: int = 2
     def apply(belief: Belief, draw: Draw, x: Array, u: Array) -> Prediction:
         h, scaling = belief.hyper, belief.scaling
         z = whiten(scaling.inputs, kernel.inputs_of(x, u, angles))
-        prior = jnp.sum(kernel.waves(draw.frequencies @ z) * draw.weights, -1)
-        update = jnp.sum(cross(h, z, belief.x) * draw.correction, -1)
+        prior = jnp.einsum("em,em->e", kernel.waves(draw.frequencies @ z), draw.weights)
+        # Not a product and a sum: of 200 rows and more, jaxlib 0.10 compiles those two into wrong numbers on a CPU.
+        update = jnp.einsum("en,en->e", cross(h, z, belief.x), draw.correction)
         return Prediction(unwhiten(scaling.targets, prior + update), h.noise * jnp.diagonal(scaling.targets.root))
 
     def moments(belief: Belief, mean: Array, cov: Array) -> gaussian.Image:
@@ -95,7 +96,8 @@ def gp(*, states: int, controls: int, angles: tuple[int, ...], features: int = 2
         image = kernel.in_raw_units(process, belief.scaling)(mean, cov)
         return image._replace(cov=image.cov + jnp.diag(jnp.maximum(-jnp.diagonal(image.cov), 0)))
 
-    return Dynamics(init, lambda data: kernel.rows_of(data, angles), loss, condition, sample, apply, moments)
+    whole = Dynamics(init, lambda data: kernel.rows_of(data, angles), loss, condition, sample, apply, moments)
+    return kernel.precise(whole)
 
 
 def gram(h: Hyper, x: Array, used: Array) -> Array:

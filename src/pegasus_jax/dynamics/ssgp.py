@@ -81,7 +81,8 @@ def ssgp(*, states: int, controls: int, angles: tuple[int, ...], points: int = 1
         )
         return kernel.in_raw_units(process, belief.scaling)(mean, cov)
 
-    return Dynamics(init, lambda data: kernel.rows_of(data, angles), loss, condition, sample, apply, moments)
+    whole = Dynamics(init, lambda data: kernel.rows_of(data, angles), loss, condition, sample, apply, moments)
+    return kernel.precise(whole)
 
 
 def design(frequencies: Array, signal: Array, noise: Array, rows: Rows) -> tuple[Array, Array]:

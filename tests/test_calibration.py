@@ -1,0 +1,85 @@
+"""Calibration along an episode: 1 for a model that tells the truth about itself, proportional to its errors."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_jax.build import compose
+from pegasus_jax.calibration import calibration
+from pegasus_jax.types import Dynamics, Prediction, Trajectory
+from probes import PENDULUM, cart, experience, known, network, noisy_linear_policy, regression, same, tiny
+
+STEPS, STATES = 400, 2
+
+
+def uncertain(function_std: float, noise_std: float) -> Dynamics:
+    """A model whose change of state is an unknown constant of that spread, seen with that noise."""
+    return known(PENDULUM)._replace(
+        sample=lambda key, belief: function_std * jax.random.normal(key, (STATES,)),
+        apply=lambda belief, draw, x, u: Prediction(draw, jnp.full((STATES,), noise_std)),
+    )
+
+
+def episode(std: float, seed: int = 0) -> Trajectory:
+    """Changes of state that are independent, zero-mean and of that spread."""
+    x = np.cumsum(np.random.default_rng(seed).normal(size=(STEPS + 1, STATES)) * std, 0)
+    return Trajectory(jnp.asarray(x, float), jnp.zeros((STEPS, 1)), jnp.zeros(STEPS))
+
+
+def found(model: Dynamics, trajectory: Trajectory, draws: int = 2000, angles: tuple[int, ...] = ()) -> float:
+    return float(calibration(jax.random.key(3), None, trajectory, dynamics=model, angles=angles, draws=draws))
+
+
+@pytest.mark.parametrize(("function_std", "noise_std"), [(0.0, 0.5), (0.5, 0.0), (0.3, 0.4)])
+def test_a_model_whose_predictions_are_the_truth_is_calibrated(function_std, noise_std):
+    """What it does not know and what it takes for noise count together: here both make .5."""
+    assert found(uncertain(function_std, noise_std), episode(0.5)) == pytest.approx(1, abs=0.08)
+
+
+@pytest.mark.parametrize("factor", [0.5, 2.0, 10.0])
+def test_calibration_is_proportional_to_the_errors(factor):
+    model = uncertain(0.0, 0.5)
+    assert found(model, episode(0.5 * factor)) == pytest.approx(factor * found(model, episode(0.5)), rel=1e-4)
+
+
+def test_a_few_wild_steps_do_not_decide():
+    wild = episode(0.5)
+    wild = wild._replace(x=wild.x.at[: STEPS // 20].multiply(1e3))
+    assert found(uncertain(0.0, 0.5), wild) == pytest.approx(1, abs=0.15)
+
+
+def test_an_angle_that_crosses_the_seam_is_no_error():
+    """The same angles, written in (-pi, pi]."""
+    turning = episode(0.5)._replace(x=jnp.linspace(0, 40, STEPS + 1)[:, None] * jnp.ones(STATES))
+    seen = turning._replace(x=jnp.arctan2(jnp.sin(turning.x), jnp.cos(turning.x)))
+    model = uncertain(0.0, 0.5)
+    assert found(model, seen, angles=(0, 1)) == pytest.approx(found(model, turning), rel=1e-3)
+
+
+def test_few_draws_say_nearly_the_same():
+    """50 draws, each a function along the whole episode, as in a run."""
+    model, data = network(), experience(rows=30)
+    belief = jax.jit(lambda: model.condition(model.init(jax.random.key(1)), data))()
+    trajectory = Trajectory(jnp.concatenate([data.x[:30], data.x[29:30] + data.y[29:30]]), data.u[:30], jnp.zeros(30))
+
+    @partial(jax.jit, static_argnums=1)
+    def ask(key, draws):
+        return calibration(key, belief, trajectory, dynamics=model, angles=(2,), draws=draws)
+
+    assert float(ask(jax.random.key(0), 50)) == pytest.approx(float(ask(jax.random.key(1), 2000)), rel=0.2)
+
+
+def test_of_an_experiment_it_is_unknown_before_there_are_data_and_changes_nothing():
+    task = cart()
+    exp = compose(tiny(fit__steps=5, search__steps=2), task, regression(2, 1), noisy_linear_policy(task))
+    state = exp.init(jax.random.key(0))
+    collect, absorb, calibrate = (jax.jit(f) for f in (exp.collect, exp.absorb, exp.calibrate))
+    assert np.isnan(calibrate(state, collect(state)))
+    after = absorb(state, collect(state))
+    flown = collect(after)
+    assert np.isfinite(calibrate(after, flown))
+    assert same(flown, collect(after))
+    assert calibrate(after, flown) == calibrate(after, flown)

@@ -1,0 +1,293 @@
+"""Figures: every file says something that can be run, a study is run once, and verdicts follow from the numbers."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from benchmarks import results_page
+from benchmarks.study import RESULTS
+from pegasus_jax.build import build
+from pegasus_jax.config import BNN, RBF, SSGP, Analytic, Config, SettingError
+from pegasus_jax.report import claims, comparison
+from pegasus_jax.report.curves import interval, middle
+from pegasus_jax.report.figures import Claim, Figure, read
+from pegasus_jax.study import first_solved, seed_list, short, study
+from test_train import call
+
+FILES = {path.stem: path for path in sorted(results_page.FIGURES.glob("*.toml"))}
+FIGURES = {name: read(path) for name, path in FILES.items()}
+TINY = """
+title = "Two clips"
+seeds = "3-4"
+trials = 2
+common = "model=deterministic policy=linear model.hidden=[4] fit.steps=2 search.steps=2 search.particles=5 \
+search.match=false search.cost=particles search.widen=1 search.restart=false"
+[variants]
+loose = "search.clip=1"
+tight = "search.clip=1e-3"
+[[claims]]
+says = "tight is better"
+lower = "tight"
+than = "loose"
+trials = [1, 2]
+"""
+
+
+def write_study(folder: Path, stem: str, cost: np.ndarray, **changes: object) -> None:
+    """A study's JSON with these mean costs [S, T]; a seed is solved where they are below .5."""
+    cost = np.asarray(cost, float)
+    fields = dict(seeds=list(range(len(cost))), plant_seconds=[2.5 * t for t in range(1, cost.shape[1] + 1)])
+    fields |= dict(mean_cost=cost.tolist(), success_rate=(cost < 0.5).astype(float).tolist(), config={})
+    fields |= dict(about={"command": f"made {stem}"}) | changes
+    (folder / f"{stem}.json").write_text(json.dumps(fields))
+
+
+def figure_of(tmp_path: Path, text: str) -> Figure:
+    path = tmp_path / "mine.toml"
+    path.write_text(text)
+    return read(path)
+
+
+# The paper's figures
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_every_variant_of_a_figure_is_an_experiment(name):
+    found = comparison.configs(FIGURES[name])
+    assert list(found) == list(FIGURES[name].variants)
+    for config in found.values():
+        assert build(config).task.name == config.task
+        assert config.trials == FIGURES[name].trials
+    assert len(set(found.values())) == len(found)  # something varies
+    assert len(seed_list(FIGURES[name].seeds)) >= 10
+
+
+def test_the_figures_vary_what_the_paper_varies():
+    crn, clip = comparison.configs(FIGURES["crn"]), comparison.configs(FIGURES["clip"])
+    assert {config.search.learning_rate for config in crn.values()} == {1e-4}
+    assert vars(crn["fixed"].search.period) == dict(start=1, dynamics=0, policy=0, sensor=0, match=0)
+    assert set(vars(crn["fresh"].search.period).values()) == {1}
+    assert [config.search.clip for config in clip.values()] == [None, 1000, 100, 10, 1, 0.1, 0.01, 0.001]
+    rbf = comparison.configs(FIGURES["rbf"])
+    assert all(isinstance(config.policy, RBF) and config.policy.units == 30 for config in rbf.values())
+    assert isinstance(rbf["ssgp_pilco"].model, SSGP)
+    assert isinstance(rbf["ssgp_pilco"].search, Analytic)
+    for name, task in (("nn", "cartpole"), ("double", "double_cartpole")):
+        for label, config in comparison.configs(FIGURES[name]).items():
+            model, _, policy = label.partition("-")
+            assert isinstance(config.model, BNN)
+            assert (config.task, config.model.dropout) == (task, model)
+            assert (config.policy.dropout > 0) == (policy == "dropout_mlp")
+
+
+@pytest.mark.parametrize("name", FIGURES)
+def test_claims_cite_variants_and_trials_that_there_are(name):
+    stems = {f"{other}-{label}" for other, figure in FIGURES.items() for label in figure.variants}
+    stems |= {path.stem for path in RESULTS.glob("*.json")}
+    for claim in FIGURES[name].claims:
+        assert claim.trials[1] <= FIGURES[name].trials
+        for side in (claim.lower, claim.than):
+            assert not isinstance(side, str) or side in FIGURES[name].variants or side in stems
+
+
+# A file of one's own
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("seeds =", "sedes =", "sedes is not a key of a figure; did you mean 'seeds'"),
+        ("trials = 2", "trials = true", "trials=True is not a whole number"),
+        ("trials = 2", "trials = 0", "trials is missing"),
+        ('title = "Two clips"', "", "title is missing"),
+        ('title = "Two clips"', 'title = "Two', "is not TOML"),
+        ('title = "Two clips"', 'title = "a"\npicture = "curve"', "did you mean 'curves'"),
+        ("loose =", '"a/b" =', "'a/b' cannot be part of a file's name"),
+        ('"search.clip=1"', "1", "variant loose is not a text of settings"),
+        (
+            "search.clip=1e-3",
+            "search.clop=1",
+            "variant tight: search.clop is not a setting; did you mean 'search.clip'",
+        ),
+        ("search.clip=1e-3", "search.clip=-1", "variant tight: search.clip=-1 is out of range"),
+        ("search.clip=1e-3", "algorithm=pilco", "variant tight: "),
+        ("policy=linear", "policy=linea", "policy=linea is unknown; did you mean 'linear'"),
+        ('than = "loose"', "", "a claim has says, lower, than, trials"),
+        ("trials = [1, 2]", "trials = [2, 1]", "trials=[2, 1] are not first and last"),
+    ],
+)
+def test_a_file_that_is_wrong_is_refused_in_one_line(old, new, message, tmp_path):
+    assert old in TINY
+    with pytest.raises(SettingError) as refusal:
+        comparison.configs(figure_of(tmp_path, TINY.replace(old, new)))
+    assert message in str(refusal.value)
+    assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["mine.tom"], "mine.tom cannot be read: No such file or directory; did you mean 'mine'"),
+        (["mine.toml", "variants=tigt"], "tigt is not a variant of figure mine; did you mean 'tight'"),
+        (["mine.toml", "output=there"], "did you mean 'out'"),
+        (["a", "b"], "name one file, not 2"),
+    ],
+)
+def test_a_wrong_command_ends_in_one_line(words, message, tmp_path):
+    (tmp_path / "mine.toml").write_text(TINY)
+    done = call("figures", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.toml"]  # nothing was written
+
+
+def test_an_environment_that_is_one_object_is_refused():
+    with pytest.raises(SettingError, match="task=gym"):
+        study(Config(task="gym"), [0])
+
+
+def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
+    (tmp_path / "mine.toml").write_text(TINY)
+    quick = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "true"}
+    first = call("figures", "mine.toml", "out=there", "variants=loose", cwd=tmp_path, **quick)
+    assert first.returncode == 0, first.stderr
+    loose, out = (tmp_path / "there" / "mine-loose.json").read_bytes(), tmp_path / "there"
+    assert sorted(path.name for path in out.iterdir()) == ["mine-loose.json", "mine.png"]
+    assert "not run yet" in first.stdout
+
+    cut_short = json.loads(loose)
+    del cut_short["about"]  # as a kill leaves it: written after each trial, without the last word
+    (out / "mine-tight.json").write_text(json.dumps(cut_short))
+    second = call("figures", "mine.toml", "out=there", cwd=tmp_path, **quick)
+    assert second.returncode == 0, second.stderr
+    assert (out / "mine-loose.json").read_bytes() == loose
+    tight = json.loads((out / "mine-tight.json").read_text())
+    assert np.shape(tight["mean_cost"]) == np.shape(tight["objective_fresh"]) == (2, 2)
+    assert tight["seeds"] == [3, 4]
+    assert tight["config"]["search.clip"] == 1e-3
+    assert [row[0] for row in tight["calibration"]] == [None, None]  # nothing was known before the first trial
+    assert all(row[1] > 0 for row in tight["calibration"])
+    assert "pegasus-figures mine.toml" in tight["about"]["command"]
+    assert tight["episode_cost"][0][0] == json.loads(loose)["episode_cost"][0][0]  # the same random first episode
+    assert "tight is better" in second.stdout
+
+    both = {path: path.read_bytes() for path in out.glob("*.json")}
+    third = call("figures", "mine.toml", "out=there", "search.clip=7", cwd=tmp_path)
+    assert third.returncode == 0, third.stderr
+    assert {path: path.read_bytes() for path in out.glob("*.json")} == both
+    assert "mine-loose.json was made with search.clip=1.0, not 7.0" in third.stderr
+    assert (out / "mine.png").read_bytes().startswith(b"\x89PNG")
+
+
+# What comes out
+
+
+def test_a_study_of_the_records_can_be_read():
+    for path in RESULTS.glob("*.json"):
+        if results_page.is_study(path):
+            result = comparison.stored(RESULTS, path.stem)
+            assert result is not None
+            assert claims.row(path.stem, result)[1] == str(len(result["seeds"]))
+
+
+@pytest.mark.parametrize("picture", ["curves", "area"])
+def test_studies_of_different_lengths_are_drawn_together(picture, tmp_path):
+    figure = figure_of(tmp_path, TINY.replace("trials = 2", f'trials = 2\npicture = "{picture}"'))
+    noise = np.random.default_rng(0).uniform(size=(10, 6))
+    write_study(tmp_path, "mine-loose", noise)
+    write_study(tmp_path, "mine-tight", noise[:3, :4])
+    path = comparison.draw(figure, comparison.results(figure, tmp_path), tmp_path)
+    assert path.read_bytes().startswith(b"\x89PNG")
+    assert path.stat().st_size > 5000
+
+
+def test_verdicts_follow_from_the_numbers(tmp_path):
+    figure = figure_of(tmp_path, TINY)
+    noise = 0.02 * np.random.default_rng(1).normal(size=(10, 4))
+    write_study(tmp_path, "mine-tight", np.array([0.9, 0.4, 0.4, 0.4]) + noise)
+    write_study(tmp_path, "mine-loose", np.array([0.9, 0.6, 0.6, 0.4]) + noise[::-1])
+
+    def verdict(lower, than, *trials):
+        return claims.judge(Claim("", lower, than, trials), figure, tmp_path).verdict
+
+    assert verdict("tight", "loose", 1, 1) == "undecided"
+    assert verdict("tight", "loose", 2, 3) == verdict("tight", "mine-loose", 1, 4) == "agrees"
+    assert verdict("loose", "tight", 2, 2) == "contradicts"
+    assert [verdict("tight", number, 2, 2) for number in (0.6, 0.4, 0.2)] == ["beats", "reaches", "misses"]
+    assert verdict("tight", "loose", 2, 5) == verdict("tight", "other-one", 1, 1) == "not run yet"
+
+
+def test_one_seed_decides_nothing(tmp_path):
+    figure = figure_of(tmp_path, TINY)
+    write_study(tmp_path, "mine-tight", np.full((1, 2), 0.1))
+    write_study(tmp_path, "mine-loose", np.full((1, 2), 0.9))
+    assert claims.judge(figure.claims[0], figure, tmp_path).verdict == "undecided"
+
+
+def test_the_interval_covers_the_middle_and_that_of_a_difference_is_antisymmetric():
+    samples = np.random.default_rng(2).normal(size=(2, 12))
+    low, high = interval(samples[0])
+    assert low < middle(samples[0]) < high
+    low, high = interval(*samples)
+    assert low < middle(samples[0]) - middle(samples[1]) < high
+    np.testing.assert_allclose(interval(samples[1], samples[0]), (-high, -low), atol=0.15)
+    many = np.random.default_rng(3).normal(size=(12, 3))
+    np.testing.assert_allclose(middle(many), [np.sort(column)[3:-3].mean() for column in many.T])
+
+
+def test_when_seeds_were_solved():
+    assert claims.when([[0, 1, 1], [0, 0, 1], [0, 0.95, 0]]) == "2, from 2 to 3"
+    assert claims.when([[0, 1], [0, 0], [0, 0], [0, 0]]) == "from 2 to 2, 3 never"
+    assert claims.when([[0, 0]]) == "never"
+    assert first_solved([0.0, 0.89, 0.9]) == 3
+
+
+def test_the_page_tells_what_was_run_from_what_was_not(tmp_path):
+    (tmp_path / "mine.toml").write_text(TINY)
+    write_study(tmp_path, "mine-loose", np.random.default_rng(0).uniform(size=(5, 2)))
+    write_study(tmp_path, "other-one", np.full((2, 3), 0.4))
+    (tmp_path / "speed.json").write_text("{}")
+    page = results_page.generated(tmp_path, tmp_path)
+    assert re.search(r"\| loose +\| 5 +\| 2 ", page)
+    assert re.search(r"\| tight +\| not run yet ", page)
+    assert re.search(r"\| other-one +\| 2 +\| 3 ", page)
+    assert "* `made other-one`" in page
+    assert "speed" not in page
+    for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
+        assert len({line.count("|") for line in table.splitlines()}) == 1
+
+
+def test_refreshing_the_page_keeps_what_a_person_wrote(tmp_path, monkeypatch):
+    (tmp_path / "mine.toml").write_text(TINY)
+    write_study(tmp_path, "mine-loose", np.random.default_rng(0).uniform(size=(5, 2)))
+    page = tmp_path / "results.md"
+    page.write_text(f"before\n{results_page.BEGIN}old{results_page.END}after\n")
+    for name, value in dict(FIGURES=tmp_path, RESULTS=tmp_path, PAGE=page).items():
+        monkeypatch.setattr(results_page, name, value)
+    results_page.main()
+    once = page.read_text()
+    assert once.startswith("before\n")
+    assert once.endswith("after\n")
+    assert "\nold" not in once
+    assert "](mine.png)" in once  # drawn, and shown
+    results_page.main()
+    assert page.read_text() == once
+
+
+def test_the_published_page_has_its_markers():
+    text = results_page.PAGE.read_text()
+    assert text.count(results_page.BEGIN) == text.count(results_page.END) == 1
+
+
+def test_unknown_numbers_are_null_and_seeds_are_lists_or_ranges():
+    assert short([[0.123456, np.nan]]) == [[0.1235, None]]
+    assert seed_list("0-3") == [0, 1, 2, 3]
+    assert seed_list("5,2") == [5, 2]
+    assert seed_list("7") == [7]
+    for text in ("9-3", "one", "", "-1"):
+        with pytest.raises(SettingError, match="names no seeds"):
+            seed_list(text)
