@@ -1,6 +1,8 @@
 """The benchmarks' own arithmetic: what is compared, what counts as slower, and that peers do the same work."""
 
 import json
+import os
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -90,3 +92,18 @@ def test_plain_torch_does_the_same_work(match, activation):
     objective, gradient = disagreement(given, problem_of(given), plain_torch.step)
     assert objective < 1e-5
     assert gradient < 1e-3
+
+
+@pytest.mark.skipif("PROB_MBRL" not in os.environ, reason="PROB_MBRL names no checkout of prob_mbrl")
+@pytest.mark.parametrize("match", ["true", "false"])
+def test_prob_mbrl_does_the_same_work(match):
+    from benchmarks.peers import of_prob_mbrl
+    from benchmarks.peers.compare import layers_of, tensor
+
+    given = workload({**TINY, "search.match": match}, horizon=3)
+    package = of_prob_mbrl.load(Path(os.environ["PROB_MBRL"]))
+    found = of_prob_mbrl.disagreement(package, given, layers_of, tensor)
+    assert found["objective"] < 1e-5
+    assert found["gradient"] < 1e-3
+    for program in of_prob_mbrl.programs(package, given, layers_of, tensor, steps=2, fit_steps=2).values():
+        program()
