@@ -19,6 +19,7 @@ from pegasus_jax.network import INITIALISERS
 from pegasus_jax.policy.squash import SQUASHES
 from pegasus_jax.search import objective
 from pegasus_jax.trial import SEARCH, trial_key
+from pegasus_jax.types import Learner
 from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
 from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, same, tiny
 
@@ -330,9 +331,11 @@ def test_the_settings_of_pilcos_search_reach_its_objective():
     policy = linear_policy(2, 1)._replace(moments=lambda gain, mean, cov: affine(mean, cov, gain))
 
     def value(**search):
-        chosen = dataclasses.replace(ANALYTIC, **search)
+        chosen = dataclasses.replace(ANALYTIC, **{"policy_noise": 0.0, "state_noise": 0.0, **search})
         searcher, _ = search_of(chosen, cart(horizon=3), dynamics, policy)
-        return float(jax.jit(searcher.value)(jax.random.key(0), jnp.full((1, 2), -0.5), None))
+        params = jnp.full((1, 2), -0.5)
+        run = jax.jit(partial(searcher.run, first=0, steps=1))
+        return float(run(jax.random.key(0), Learner(params, searcher.init(params)), None)[1].objective[0])
 
     plain = value()
     np.testing.assert_allclose(value(aggregate="total"), 3 * plain, rtol=1e-4)
