@@ -4,8 +4,8 @@
 
 Starts `pegasus-train` once a seed, `jobs` at a time and each in an empty folder with an empty compilation cache, and
 stops it as soon as a trial's evaluation succeeds in at least 90 % of its episodes, or after `minutes`. Writes
-benchmarks/results/newcomer.json. Times mean something only where nothing else runs; on Linux each job is kept on
-two processors of its own, so that eight jobs on sixteen processors are what one is on two.
+benchmarks/results/newcomer.json. Times mean something only where nothing else runs; on Linux the jobs share out the
+processors, each with its own.
 """
 
 import json
@@ -65,7 +65,7 @@ def main(words: list[str]) -> None:
     slots: Slots = SimpleQueue()
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
     for job in range(jobs):
-        slots.put({*cores[2 * job : 2 * job + 2]} or None)
+        slots.put({*cores[job::jobs]} or None)
     with ThreadPoolExecutor(jobs) as pool:
         seeds = seed_list(options.get("seeds", "0-9"))
         results = list(pool.map(lambda seed: newcomer(seed, train, limit, slots), seeds))

@@ -185,7 +185,7 @@ WRONG = [
     # unknown variants
     (["task=cartpol"], ["task=cartpol is unknown", "did you mean 'cartpole'?"]),
     (["model=lognormal"], ["model=lognormal is unknown", "did you mean 'log_normal'?"]),
-    (["policy=drop_mlp"], ["did you mean 'dropout_mlp'?", "choices: dropout_mlp, mlp"]),
+    (["policy=drop_mlp"], ["did you mean 'dropout_mlp'?", "choices: mlp, dropout_mlp"]),
     (["algorithm=pilko"], ["algorithm=pilko is unknown", "did you mean 'pilco'?"]),
     (["task="], ["task= is unknown", "cartpole"]),
     # unknown keys

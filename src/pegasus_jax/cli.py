@@ -17,7 +17,7 @@ pegasus-train resume=RUN [trials=N]             go on with a run, also one that 
 
   task=cartpole         what to learn: {tasks}
   model=log_normal      dynamics model: {models}
-  policy=dropout_mlp    controller: {policies}
+  policy=mlp            controller: {policies}
   algorithm=pegasus     how to search: {algorithms}
   out=runs/...          the run's folder (default: runs/TASK-seedN)
   seeds=1               so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN

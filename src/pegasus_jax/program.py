@@ -66,14 +66,15 @@ class Program:
         }
         self.spent: dict[str, float] = {}
 
-    def prepare(self, part: str) -> None:
-        """Begin to compile a part, whose arguments are states and whole numbers, while other parts are at work."""
+    def prepare(self, part: str, *others: Any) -> None:
+        """Begin to compile a part of states and `others`, or of states and a whole number, while others are at work."""
         jitted = self.parts[part]
         if jitted.compiled or jitted.coming:
             return
         keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), self.seeds))
         states = self.parts["init"].function.eval_shape(keys)
-        arguments: tuple[Any, ...] = (states, *(jax.ShapeDtypeStruct((), jnp.int32) for _ in self.axes[part][1:]))
+        rest = others or tuple(jax.ShapeDtypeStruct((), jnp.int32) for _ in self.axes[part][1:])
+        arguments: tuple[Any, ...] = (states, *rest)
         if self.mesh is not None:
             arguments = self.laid_out(part, arguments, described)
         worker = ThreadPoolExecutor(1)

@@ -39,8 +39,8 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
             raise SettingError(f"{name}={value} is unknown; {nearest(value, VARIANTS[name])}")
     variants: dict[str, Any] = {
         **MODELS[chosen.get("model", "log_normal")],
-        **POLICIES[chosen.get("policy", "dropout_mlp")],
         **ALGORITHMS[chosen.get("algorithm", "pegasus")],
+        **(POLICIES[chosen["policy"]] if "policy" in chosen else {}),
     }
     sections = {name: value for name, value in variants.items() if dataclasses.is_dataclass(value)}
     config = dataclasses.replace(Config(task=chosen.get("task", Config.task)), **sections)

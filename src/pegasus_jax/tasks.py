@@ -59,21 +59,23 @@ NAMES = (*TASKS, GYM, MJCF)
 # A cost of one's own has neither an expectation nor a width; and so the swimmer was measured.
 _PLAIN_COST: dict[str, Any] = {"search.cost": "particles", "search.widen": 1.0}
 
-# docs/reference.md 2.2; the paper's networks and step size.
+# docs/reference.md 2.2; the paper's networks, dropout and step size.
 _DOUBLE_CARTPOLE: dict[str, Any] = {
     "trials": 40,
     "model.hidden": (200,) * 4,
     "policy.hidden": (50,) * 4,
+    "policy.dropout": 0.1,
     "search.learning_rate": 1e-4,
     "explore.trials": 2,
 }
 
-# docs/reference.md 3.4; what the legs do not change. The policy's dropout is the paper's .1, as everywhere.
+# docs/reference.md 3.4; what the legs do not change. The policy's dropout is the paper's .1, as on every plant.
 _SWIMMER: dict[str, Any] = {
     "trials": 50,
     "model.hidden": (200,) * 4,
     "model.initialiser": "orthogonal",
     "policy.hidden": (200,) * 4,
+    "policy.dropout": 0.1,
     "policy.initialiser": "orthogonal",
     "search.steps": 500,
     "search.learning_rate": 1e-4,

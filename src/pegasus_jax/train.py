@@ -99,12 +99,14 @@ def one_trial(
     display.phase(trial, "collect")
     episodes = collected(states, trial, config, runs, task, program)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes)
-    calibration = fetched(program("calibrate", states, stacked))  # before this episode teaches the model
+    # Before this episode teaches the model. The first has none to judge, and should not wait for the compiler.
+    calibration = fetched(program("calibrate", states, stacked)) if trial > 1 else np.full(len(runs), np.nan)
     states = program("absorb", states, stacked)
     display.phase(trial, "fit", 0.02)
     states, fitted = fetched_info(program("fit", states))
     found = []
     program.prepare("imagine")
+    program.prepare("calibrate", stacked)
     for i in range(program.chunks):
         cost = np.mean(found[-1].objective[:, -1]) if found else None
         display.phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)

@@ -19,8 +19,8 @@ MODELS: dict[str, dict[str, Any]] = {
     "ssgp": {"model": SSGP(), "fit": LBFGS(), "fit.steps": 300},
 }
 POLICIES: dict[str, dict[str, Any]] = {
-    "dropout_mlp": {},
-    "mlp": {"policy": MLP(dropout=0.0)},
+    "mlp": {"policy.dropout": 0.0},
+    "dropout_mlp": {"policy.dropout": 0.1},
     "rbf": {"policy": RBF()},
     "rbf100": {"policy": RBF(units=100)},
     "linear": {"policy": Linear()},
@@ -30,6 +30,7 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "paper": {  # Alg. 3 as printed: all draws but the start particles held for a whole search
         "model.activation": "relu",
         "model.kl_weight": 1.0,
+        "policy.dropout": 0.1,
         "fit.learning_rate": 1e-4,
         "search.period.start": 1,
         "search.period.dynamics": 0,
@@ -44,6 +45,7 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
     "deep_pilco": {  # Alg. 2: everything redrawn every iteration, no clipping
         "model.activation": "relu",
         "model.kl_weight": 1.0,
+        "policy.dropout": 0.1,
         "fit.learning_rate": 1e-4,
         "search.restart": False,
         "search.particles": 10,
