@@ -292,7 +292,7 @@ class Analytic:
     aggregate: str = setting("mean", "over the horizon: mean, or total, PILCO's sum")
     discount: float = setting(1.0, "weight of a later step against the one before")
     restart: bool = setting(True, "start a search from a fresh policy when it expects a lower cost than the old one")
-    policy_noise: float = setting(0.0, "factor of the model's noise on what the policy sees")
+    policy_noise: float = setting(1.0, "factor of the model's noise on what the policy sees")
     state_noise: float = setting(1.0, "factor of the model's noise added to the state")
     cost_noise: float = setting(0.0, "factor of the model's noise on what the cost sees")
     reset = True  # no setting: curvature is that of one model
