@@ -24,7 +24,7 @@ train: $(STAMP) ## learn the cart-pole swing-up; settings: make train ARGS="tria
 	$(BIN)/pegasus-train $(if $(filter task=% resume=% --help -h,$(ARGS)),,task=cartpole) $(ARGS)
 
 test: $(STAMP) ## run the tests on JOBS=2 cores; some of them: make test ARGS="-k layers"
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --durations 10 $(ARGS)
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations 10 $(ARGS)
 
 check: $(STAMP) ## formatting, lint, types, layers: everything that needs no training
 	$(BIN)/ruff format --check $(CODE)

@@ -19,6 +19,15 @@ settings.register_profile("repository", deadline=None, derandomize=True, max_exa
 settings.load_profile("repository")
 
 
+# The files that take minutes: begun first, so that at the end no processor waits for another's last file.
+LONG = ("test_family", "test_train", "test_seeds", "test_docs", "test_figures", "test_tasks", "test_build", "test_play")
+
+
+def pytest_collection_modifyitems(items):
+    """Long files first, otherwise as they came."""
+    items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
+
+
 @pytest.fixture
 def x64():
     """Float64 inside one test, for closed forms and finite differences."""

@@ -24,7 +24,7 @@ def test_layers_given_as_a_list_are_still_hashable():
 
 
 def test_the_defaults_are_the_measured_ones():
-    """docs/decisions/0001: a change here changes every result. test_settings holds algorithm=paper to the paper."""
+    """docs/decisions/0001 to 0003: a change here changes every result. test_settings holds algorithm=paper to the paper."""
     c = Config()
     assert (c.model.hidden, c.model.dropout, c.model.heteroscedastic, c.model.whitening) == (
         (200, 200),
@@ -32,7 +32,7 @@ def test_the_defaults_are_the_measured_ones():
         True,
         "full",
     )
-    assert (c.policy.hidden, c.policy.dropout, c.policy.execution) == ((200, 200), 0.1, "sampled")
+    assert (c.policy.hidden, c.policy.dropout, c.policy.execution) == ((200, 200), 0.0, "sampled")
     assert (c.fit.steps, c.fit.batch, c.fit.learning_rate, c.fit.reset) == (2000, 100, 3e-4, False)
     assert (c.search.steps, c.search.particles, c.search.learning_rate, c.search.clip) == (1000, 100, 1e-3, 1.0)
     assert (c.search.match, c.search.aggregate, c.search.discount) == (True, "mean", 1.0)
