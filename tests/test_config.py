@@ -24,7 +24,7 @@ def test_layers_given_as_a_list_are_still_hashable():
 
 
 def test_the_defaults_are_the_measured_ones():
-    """docs/decisions/0001 to 0003: a change here changes every result. test_settings holds algorithm=paper to the paper."""
+    """docs/decisions: a change here changes every result. test_settings holds algorithm=paper to the paper."""
     c = Config()
     assert (c.model.hidden, c.model.dropout, c.model.heteroscedastic, c.model.whitening) == (
         (200, 200),
