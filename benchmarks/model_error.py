@@ -67,11 +67,16 @@ def errors(config: Config, counts: list[int]) -> dict[str, Any]:
             error, variance = change - mean.mean(0), mean.var(0) + (std**2).mean(0)
             scale = change.std(0)
             found[str(count)] = {
-                "median": np.round(jnp.median(jnp.abs(error), 0) / scale, 3).tolist(),
-                "rms": np.round(jnp.sqrt((error**2).mean(0)) / scale, 3).tolist(),
+                "median": rounded(jnp.median(jnp.abs(error), 0) / scale),
+                "rms": rounded(jnp.sqrt((error**2).mean(0)) / scale),
                 "calibration": round(float(jnp.sqrt(jnp.median(error**2 / variance)) / HALF), 2),
             }
     return found
+
+
+def rounded(values: Array) -> list[float]:
+    """As JSON should have them."""
+    return np.asarray(values, float).round(3).tolist()
 
 
 def main(words: list[str]) -> None:
