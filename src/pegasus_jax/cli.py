@@ -21,7 +21,8 @@ pegasus-train resume=RUN [trials=N]             go on with a run, also one that 
   algorithm=pegasus     how to search: {algorithms}
   out=runs/...          the run's folder (default: runs/TASK-seedN)
   seeds=1               so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN
-  mesh=SEEDSxPARTICLES  the devices that share seeds and particles (default: as many as share the seeds evenly)
+  mesh=SEEDSxPARTICLES  the devices that share seeds and particles (default: as many GPUs, or cores of a CPU, as share
+                        the seeds evenly)
   distributed=true      started on several hosts at once by SLURM or MPI: their devices act as one machine; without
                         those, coordinator=HOST:PORT processes=N process=I on each. They share OUT on one file system
 
@@ -148,6 +149,8 @@ def _train(words: Sequence[str]) -> None:
     if len(runs) > 1 and config.task == tasks.GYM:
         raise SettingError(f"seeds={len(runs)} is too many for task=gym, whose environment is one object; seeds=1")
     _join(options)
+    if not {"mesh", "distributed", "coordinator"} & {*options}:
+        _share_processors(len(runs))
     over = _mesh(options.get("mesh"), len(runs))
     from pegasus_jax.build import build, set_precision
     from pegasus_jax.program import leads
@@ -185,6 +188,19 @@ def _join(options: dict[str, str]) -> None:
             jax.distributed.initialize()  # SLURM, Open MPI and others say where the coordinator is
     except (RuntimeError, ValueError) as error:
         raise SettingError(f"distributed=true: {str(error).splitlines()[0]}; or give coordinator=HOST:PORT") from error
+
+
+def _share_processors(seeds: int) -> None:
+    """Where a CPU does the work, make a device of as many of its cores as share the seeds evenly, unless JAX was told.
+
+    One program for all seeds hardly uses a second core: a seed's matrices are too small to be shared.
+    """
+    import jax
+
+    told = jax.config.jax_num_cpu_devices > 0 or "xla_force_host_platform" in os.environ.get("XLA_FLAGS", "")
+    if not told:
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+        jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if seeds % n == 0))
 
 
 def _mesh(text: str | None, seeds: int) -> Any:
