@@ -12,7 +12,13 @@ import pytest
 from benchmarks import compare, scaling, timing
 from benchmarks.workloads import SIZES, flop, products, workload
 
-TINY = {"task": "cartpole", "search.particles": "20", "model.hidden": "[8,8]", "policy.hidden": "[7]"}
+TINY = {
+    "task": "cartpole",
+    "policy": "dropout_mlp",
+    "search.particles": "20",
+    "model.hidden": "[8,8]",
+    "policy.hidden": "[7]",
+}
 
 
 @pytest.fixture(scope="module")
