@@ -15,10 +15,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from pathlib import Path
 from typing import Any
 
-RESULTS = Path(__file__).parent / "results"
 STARTED = "PEGASUS_STARTED"  # when the command was given [s since 1970]
 
 
@@ -59,18 +57,20 @@ def once(words: list[str], cache: str) -> dict[str, float]:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    repeats = int(next((word[8:] for word in words if word.startswith("repeats=")), "3"))
-    settings = ["task=cartpole", *(word for word in words if not word.startswith("repeats="))]
+    from benchmarks.study import RESULTS  # here: what this module imports, the measured process waits for
+    from pegasus_jax import settings
+    from pegasus_jax.record import about, processors
+
+    options, rest = settings.split(words, ("repeats",))
+    train = [f"{key}={value}" for key, value in ({"task": "cartpole"} | rest).items()]
     rows: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
-    for _ in range(repeats):
+    for _ in range(int(options.get("repeats", "3"))):
         with tempfile.TemporaryDirectory() as cache:
             for name, runs in rows.items():
-                runs.append(once(settings, cache))
+                runs.append(once(train, cache))
                 print(name, json.dumps({part: round(seconds, 2) for part, seconds in runs[-1].items()}), flush=True)
-    from pegasus_jax.record import about
-
     result: dict[str, Any] = {name: min(runs, key=lambda run: run["total"]) for name, runs in rows.items()}
-    result |= {"runs": rows, "cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else None}
+    result |= {"runs": rows, "cpus": processors()}
     result["about"] = about(shlex.join(["python", "-m", "benchmarks.first_step", *words]))
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "first_step.json").write_text(json.dumps(result, indent=1) + "\n")

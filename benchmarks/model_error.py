@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.study import RESULTS
-from pegasus_jax import dataset, episode, settings
+from pegasus_jax import episode, settings
+from pegasus_jax.angles import difference
 from pegasus_jax.build import build, set_precision
-from pegasus_jax.calibration import DRAWS, HALF
+from pegasus_jax.calibration import one_step_errors, overconfidence
 from pegasus_jax.config import Config
 from pegasus_jax.record import about
-from pegasus_jax.types import Array, Key, Prediction, RunState, Task, Trajectory
+from pegasus_jax.types import Array, Key, RunState, Task, Trajectory
 
 TESTS = 20
 MODELS = "log_normal,binary,ensemble,gp,ssgp"
@@ -49,27 +50,24 @@ def errors(config: Config, counts: list[int]) -> dict[str, Any]:
     task, dynamics = experiment.task, experiment.dynamics
     walks = random_walks(task, counts[-1] + TESTS)
     tests = jax.tree.map(lambda leaf: leaf[counts[-1] :], walks)
-    flat = partial(jnp.reshape, shape=(TESTS * task.horizon, -1))
-    change = flat(dataset.difference(tests.x[:, 1:], tests.x[:, :-1], task.angles))
+    scale = difference(tests.x[:, 1:], tests.x[:, :-1], task.angles).std((0, 1))
 
     @jax.jit
-    def asked(state: RunState, x: Array, u: Array) -> Prediction:
+    def asked(state: RunState) -> tuple[Array, Array]:
         belief = dynamics.condition(state.model.params, state.data)
-        draws = jax.vmap(dynamics.sample, (0, None))(jax.random.split(jax.random.key(1), DRAWS), belief)
-        return jax.vmap(lambda draw: jax.vmap(partial(dynamics.apply, belief, draw))(x, u))(draws)
+        one = partial(one_step_errors, jax.random.key(1), belief, dynamics=dynamics, angles=task.angles)
+        return jax.vmap(one)(tests)  # [N, H, D] each
 
     state, fit, found = jax.jit(experiment.init)(jax.random.key(config.seed)), jax.jit(experiment.fit), {}
     for count in range(1, counts[-1] + 1):
         state = experiment.absorb(state, jax.tree.map(lambda leaf: leaf[count - 1], walks))  # noqa: B023
         if count in counts:
             state, _ = fit(state)
-            mean, std = asked(state, flat(tests.x[:, :-1]), flat(tests.u))
-            error, variance = change - mean.mean(0), mean.var(0) + (std**2).mean(0)
-            scale = change.std(0)
+            error, variance = asked(state)
             found[str(count)] = {
-                "median": rounded(jnp.median(jnp.abs(error), 0) / scale),
-                "rms": rounded(jnp.sqrt((error**2).mean(0)) / scale),
-                "calibration": round(float(jnp.sqrt(jnp.median(error**2 / variance)) / HALF), 2),
+                "median": rounded(jnp.median(jnp.abs(error), (0, 1)) / scale),
+                "rms": rounded(jnp.sqrt((error**2).mean((0, 1))) / scale),
+                "calibration": round(float(overconfidence(error, variance)), 2),
             }
     return found
 

@@ -23,8 +23,8 @@ from typing import Any
 from benchmarks.study import RESULTS, seed_list
 from pegasus_jax import settings
 from pegasus_jax.record import about, trials
+from pegasus_jax.sweep import PROGRAM
 
-TRAIN = [sys.executable, "-c", "from pegasus_jax.cli import train; train()"]
 Slots = SimpleQueue[set[int] | None]
 
 
@@ -36,7 +36,7 @@ def newcomer(seed: int, words: list[str], limit: float, slots: Slots) -> dict[st
         env = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(Path(folder) / "cache")}
         began = time.monotonic()
         process = subprocess.Popen(
-            [*TRAIN, *words, f"seed={seed}", f"out={run}"],
+            [*PROGRAM, *words, f"seed={seed}", f"out={run}"],
             env=env,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,

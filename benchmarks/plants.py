@@ -8,7 +8,6 @@ Accuracy: 20 s under random controls, 8 seeds. Energy: 10 s without friction and
 """
 
 import json
-import os
 import shlex
 import sys
 import time
@@ -29,7 +28,7 @@ from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.physics import Motion
 from pegasus_envs.plant import Plant, simulate
 from pegasus_envs.swimmer import HIPS, swimmer
-from pegasus_jax.record import about
+from pegasus_jax.record import about, processors
 
 SECONDS, SEEDS, TIMES = 20.0, 8, (0.5, 1, 2, 3, 5, 10, 20)
 BATCHES = (1, 10, 100)
@@ -163,7 +162,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    cores = len(os.sched_getaffinity(0))
+    cores = processors()
     rows = {name: {"cost": cost(plant, drive(plant)), "strays": strays(plant, drive)}
             for name, (plant, drive) in PLANTS.items()}  # fmt: skip
     rows["cartpole"]["energy_drift"] = energy_drift(cartpole(friction=0.0))

@@ -8,7 +8,6 @@ alone in the same process with the same shapes. On a process pinned to one CPU (
 """
 
 import json
-import os
 import resource
 import shlex
 import sys
@@ -26,7 +25,7 @@ from benchmarks.workloads import SIZES, Workload, flop, workload
 from pegasus_jax import settings
 from pegasus_jax.build import build
 from pegasus_jax.config import Config
-from pegasus_jax.record import about
+from pegasus_jax.record import about, processors
 
 RESULTS = Path(__file__).parent / "results"
 STEPS, FIT_STEPS, PRODUCTS = 10, 100, 500  # steps, and products, in one timed run
@@ -165,7 +164,7 @@ def main(words: list[str]) -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     print(table(rows))
     print(f"peak memory of the process {peak / 1e9:.2f} GB")
-    machine = {"cpus": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()}
+    machine = {"cpus": processors()}
     command = shlex.join(["python", "-m", "benchmarks.suite", *words])
     result = {"rows": rows, "peak_memory_bytes": peak, "machine": machine, "about": about(command)}
     out = Path(options.get("out", RESULTS / "speed.json"))

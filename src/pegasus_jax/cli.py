@@ -197,11 +197,12 @@ def _share_processors(seeds: int) -> None:
     """
     import jax
 
+    from pegasus_jax.record import processors
+
     asked = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
     told = asked > 0 or "xla_force_host_platform" in os.environ.get("XLA_FLAGS", "")
     if not told:
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-        jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cores + 1) if seeds % n == 0))
+        jax.config.update("jax_num_cpu_devices", max(n for n in range(1, processors() + 1) if seeds % n == 0))
 
 
 def _mesh(text: str | None, seeds: int) -> Any:

@@ -87,10 +87,15 @@ def seeds_of(path: Path) -> dict[int, Path]:
     return {int(p.parent.name.removeprefix("seed")): p.parent for p in found if p.parent.name[4:].isdecimal()}
 
 
+def holds(path: Path) -> bool:
+    """Whether the folder is a run, or has those of many seeds."""
+    return (path / "config.yaml").exists() or bool(seeds_of(path))
+
+
 def free(path: Path) -> Path:
     """The first of path, path-2, path-3, ... that holds no run."""
     candidates = [path, *(path.with_name(f"{path.name}-{i}") for i in range(2, 10_000))]
-    return next(p for p in candidates if not ((p / "config.yaml").exists() or seeds_of(p)))
+    return next(p for p in candidates if not holds(p))
 
 
 def lock(path: Path) -> FileLock:
@@ -157,6 +162,11 @@ def write_trials(run: Path, rows: list[dict[str, Any]]) -> None:
     """Replace trials.jsonl by these rows."""
     text = "".join(json.dumps(row) + "\n" for row in rows)
     write_whole(run / "trials.jsonl", lambda file: file.write(text.encode()))
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def about(command: str) -> dict[str, Any]:

@@ -77,6 +77,11 @@ def leaves(node: Any, prefix: str = "") -> dict[str, Any]:
     return found
 
 
+def plain(config: Config) -> dict[str, Any]:
+    """`leaves` as YAML and JSON have them: with lists, not tuples."""
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in leaves(config).items()}
+
+
 def help_lines(node: Any, prefix: str = "") -> list[str]:
     """One line a setting: name=default and what it is for."""
     lines: list[str] = []
@@ -91,8 +96,7 @@ def help_lines(node: Any, prefix: str = "") -> list[str]:
 
 def save(config: Config, path: Path) -> None:
     """Write the resolved config as YAML that `load` reads; the file appears whole or not at all."""
-    plain = {name: list(value) if isinstance(value, tuple) else value for name, value in leaves(config).items()}
-    text = OmegaConf.to_yaml(OmegaConf.create(plain))
+    text = OmegaConf.to_yaml(OmegaConf.create(plain(config)))
     write_whole(path, lambda file: file.write(text.encode()))
 
 

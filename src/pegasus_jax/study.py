@@ -16,7 +16,7 @@ from pegasus_jax.build import build, set_precision
 from pegasus_jax.config import Config, SettingError
 from pegasus_jax.record import write_whole
 from pegasus_jax.tasks import GYM
-from pegasus_jax.train import saturated
+from pegasus_jax.train import saturated, succeeded
 from pegasus_jax.trial import TrialInfo, trial
 from pegasus_jax.types import Array, Experiment, RunState, Task, Trajectory
 
@@ -72,17 +72,16 @@ def stacked(trials: list[Any]) -> Any:
 def curves(config: Config, seeds: list[int], info: TrialInfo, task: Task) -> dict[str, Any]:
     """What is kept of the trials so far [S, T, ...]."""
     costs = info.evaluation  # [S, T, E, H]
-    success = np.mean(costs[..., -5:], -1) < task.success
     return {
         "seeds": seeds,
         "plant_seconds": np.round(task.horizon * task.dt * np.arange(1, costs.shape[1] + 1), 6).tolist(),
         "mean_cost": short(costs.mean((2, 3))),
-        "success_rate": success.mean(2).tolist(),
+        "success_rate": succeeded(costs, task).mean(2).tolist(),
         "episode_cost": short(info.trajectory.cost.mean(2)),
         "objective_last": short(info.search.objective[..., -1]),
         "saturated": short(saturated(info.trajectory.u, task)),
         "skipped_updates": info.search.skipped.tolist(),
-        "config": {k: list(v) if isinstance(v, tuple) else v for k, v in settings.leaves(config).items()},
+        "config": settings.plain(config),
     }
 
 

@@ -41,6 +41,7 @@ examples
 OPTIONS = ("launcher", "jobs", "out", "seeds", "mesh")
 OF_TRAIN = ("seeds", "mesh")  # of those, pegasus-train's
 YEAR = 365 * 24 * 60  # [min]
+PROGRAM = [sys.executable, "-c", "from pegasus_jax.cli import train; train()"]  # pegasus-train, wherever that is
 
 
 class Job(NamedTuple):
@@ -103,7 +104,7 @@ def check(job: Job) -> None:
     config = tasks.pinned(settings.parse(words, options=OPTIONS))
     set_precision(config)
     build(replace(config, seed=0))
-    if (job.run / "config.yaml").exists() or record.seeds_of(job.run):
+    if record.holds(job.run):
         raise SettingError(f"{job.run} holds a run already; another out= keeps both")
 
 
@@ -193,5 +194,4 @@ def _command(job: Job, environment: dict[str, str] | None = None) -> Any:
     """What a launcher calls: a fresh interpreter, so that no two runs share anything."""
     from submitit.helpers import CommandFunction
 
-    code = "from pegasus_jax.cli import train; train()"
-    return CommandFunction([sys.executable, "-c", code, *job.words], verbose=False, env=environment)
+    return CommandFunction([*PROGRAM, *job.words], verbose=False, env=environment)

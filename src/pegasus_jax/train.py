@@ -167,11 +167,15 @@ def evaluate(
     follow = jnp.asarray(False)  # the policy, not random controls
     each = jax.vmap(lambda key: jax.random.split(key, episodes), out_axes=1)(keys)
     costs = np.stack([np.asarray(fetched(episode(some, params, follow).cost)) for some in each], axis=1)  # [S, E, H]
-    success = np.mean(costs[..., -5:], axis=-1) < task.success
     return [
-        {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(succeeded))}
-        for cost, succeeded in zip(costs, success, strict=True)
+        {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(success))}
+        for cost, success in zip(costs, succeeded(costs, task), strict=True)
     ]
+
+
+def succeeded(costs: Any, task: Task) -> np.ndarray:
+    """Which episodes [...] of costs [..., H] succeeded: their last five steps cost little on average."""
+    return np.mean(costs[..., -5:], axis=-1) < task.success
 
 
 def saturated(u: Any, task: Task) -> np.ndarray:

@@ -99,7 +99,7 @@ def differences(figure: Figure, there: dict[str, Result], seeds: str = "", chang
     """A line for each study that was made with other seeds or settings than the figure now asks for."""
     lines, chosen = [], seed_list(seeds or figure.seeds)
     for label, config in configs(figure, changes).items():
-        asked = {k: list(v) if isinstance(v, tuple) else v for k, v in settings.leaves(config).items() if k != "seed"}
+        asked = {key: value for key, value in settings.plain(config).items() if key != "seed"}
         had = there[label]["config"] if label in there else {}
         other = [f"{key}={had[key]}, not {value}" for key, value in asked.items() if key in had and had[key] != value]
         if label in there and there[label]["seeds"] != chosen:
