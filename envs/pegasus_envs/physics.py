@@ -11,9 +11,9 @@ needs. The physics is MJX's own, and tests hold it to `mjx.step` and to C MuJoCo
 
 import copy
 import io
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import redirect_stdout
-from functools import cache
+from functools import cache, partial
 from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -27,7 +27,6 @@ from jax import Array
 with redirect_stdout(io.StringIO()):  # on import MJX prints that warp, which we do not use, is not installed
     from mujoco import mjx
 
-from pegasus_envs.fluid import passive_force
 from pegasus_envs.inertia import solve
 
 ASSETS = Path(__file__).parent / "assets"
@@ -49,6 +48,9 @@ Scalar = float | Array
 
 Change = tuple[str, Any, Any]
 """a field of MuJoCo's model, an index into it, the value to put there"""
+
+Accelerate = Callable[[Array, Array, Array], Array]
+"""(positions [nq, ...], velocities [nv, ...], actuator commands [nu, ...]) -> generalised acceleration [nv, ...]"""
 
 _Stage = tuple[Array, Array, Array, Array]
 """velocity and acceleration of the last stage, their weighted means so far: each [nv]"""
@@ -131,31 +133,33 @@ def _put(array: Any, index: Any, value: Any) -> Any:
 
 
 def acceleration(physics: Physics, qpos: Array, qvel: Array, control: Array) -> Array:
-    """Generalised acceleration [nv] under actuator commands [nu]."""
-    model = physics.device
+    """Generalised acceleration [nv] under actuator commands [nu]; of a mechanism without springs, in no fluid."""
+    model, host = physics.device, physics.host
+    if host.jnt_stiffness.any() or host.opt.density > 0.0 or host.opt.viscosity > 0.0:
+        raise ValueError("the only passive forces that are computed here are those of dampers")
     data = physics.blank.replace(qpos=qpos, qvel=qvel, ctrl=control)
     for compute in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.transmission, mjx.com_vel, mjx.rne):
         data = compute(model, data)
     moment = data._impl.actuator_moment
     data = mjx.fwd_actuation(model, data.tree_replace({"_impl.actuator_velocity": moment @ qvel}))
-    force = passive_force(physics, data) - data.qfrc_bias + data.qfrc_actuator
-    return solve(mjx.full_m(model, data), force, tuple(physics.host.dof_parentid.tolist()))
+    force = data.qfrc_actuator - data.qfrc_bias - model.dof_damping * qvel
+    return solve(mjx.full_m(model, data), force[:, None])[:, 0]
 
 
-def displace(physics: Physics, qpos: Array, velocity: Array, time: Array | float) -> Array:
-    """Positions [nq] after moving with a constant generalised velocity [nv] for a time [s].
+def displace(qpos: Array, velocity: Array, time: Array | float) -> Array:
+    """Positions [nq, ...] after moving with a constant generalised velocity [nv, ...] for a time [s].
 
     The free joint, where there is one, comes first: a position, then a quaternion that turns in the body's frame.
     """
-    if physics.host.nq == physics.host.nv:
+    if len(qpos) == len(velocity):
         return qpos + time * velocity
     turned = rotate(qpos[3:7], time * velocity[3:6])
     return jnp.concatenate([qpos[:3] + time * velocity[:3], turned, qpos[7:] + time * velocity[6:]])
 
 
 def rotate(quaternion: Array, turn: Array) -> Array:
-    """Turn an attitude [w x y z] by a rotation vector [rad] given in the body's frame."""
-    half = 0.5 * jnp.sqrt(turn @ turn + 1e-30)  # the small number keeps the derivative at rest finite
+    """Turn an attitude [w x y z], [4, ...], by a rotation vector [3, ...] [rad] given in the body's frame."""
+    half = 0.5 * jnp.sqrt((turn * turn).sum(axis=0) + 1e-30)  # the small number keeps the derivative at rest finite
     w, (x, y, z) = jnp.cos(half), 0.5 * turn * jnp.sinc(half / jnp.pi)
     a, b, c, d = quaternion
     product = [
@@ -165,19 +169,18 @@ def rotate(quaternion: Array, turn: Array) -> Array:
         a * z + b * y - c * x + d * w,
     ]
     turned = jnp.stack(product)
-    return turned / jnp.sqrt(turned @ turned)
+    return turned / jnp.sqrt((turned * turned).sum(axis=0))
 
 
-def runge_kutta(physics: Physics, motion: Motion, control: Array) -> tuple[Array, Array]:
-    """Mean velocity and acceleration [nv] over one time step of the model, with the actuator commands [nu] held."""
-    step = physics.host.opt.timestep
+def runge_kutta(accelerate: Accelerate, motion: Motion, control: Array, step: float) -> tuple[Array, Array]:
+    """Mean velocity and acceleration [nv, ...] over a time step [s], with the actuator commands [nu, ...] held."""
 
     def stage(carry: _Stage, tableau: Array) -> tuple[_Stage, None]:
         velocity, slope, mean_velocity, mean_slope = carry
         offset, weight = tableau[0] * step, tableau[1]
-        qpos = displace(physics, motion.qpos, velocity, offset)
+        qpos = displace(motion.qpos, velocity, offset)
         velocity = motion.qvel + offset * slope
-        slope = acceleration(physics, qpos, velocity, control)
+        slope = accelerate(qpos, velocity, control)
         return (velocity, slope, mean_velocity + weight * velocity, mean_slope + weight * slope), None
 
     zero = jnp.zeros_like(motion.qvel)
@@ -186,11 +189,10 @@ def runge_kutta(physics: Physics, motion: Motion, control: Array) -> tuple[Array
     return velocity, slope
 
 
-def advance(physics: Physics, motion: Motion, control: Array) -> Motion:
-    """The motion one time step of the model later."""
-    step = physics.host.opt.timestep
-    velocity, slope = runge_kutta(physics, motion, control)
-    return Motion(displace(physics, motion.qpos, velocity, step), motion.qvel + step * slope)
+def advance(accelerate: Accelerate, motion: Motion, control: Array, step: float) -> Motion:
+    """The motion a time step [s] later."""
+    velocity, slope = runge_kutta(accelerate, motion, control, step)
+    return Motion(displace(motion.qpos, velocity, step), motion.qvel + step * slope)
 
 
 def hold(physics: Physics, motion: Motion, control: Array, dt: float) -> Motion:
@@ -203,7 +205,7 @@ def hold(physics: Physics, motion: Motion, control: Array, dt: float) -> Motion:
 
     def substep(carry: tuple[Motion, Motion], _: None) -> tuple[tuple[Motion, Motion], None]:
         motion, lost = carry
-        velocity, slope = runge_kutta(physics, motion, control)
+        velocity, slope = runge_kutta(partial(acceleration, physics), motion, control, step)
         qpos, lost_qpos = _add(motion.qpos, lost.qpos, step * velocity)
         qvel, lost_qvel = _add(motion.qvel, lost.qvel, step * slope)
         return (Motion(qpos, qvel), Motion(lost_qpos, lost_qvel)), None

@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from pegasus_envs import physics
+from pegasus_envs import flippers, physics
 from pegasus_envs.attitude import angles_of, quaternion_of
+from pegasus_envs.batching import batch_last
 from pegasus_envs.goals import START_DEPTH, Cost, Task, goal
+from pegasus_envs.mechanism import Mechanism, mechanism
 from pegasus_envs.physics import Motion, Scalar
 from pegasus_envs.plant import FRAME, Plant, draw_start, gliding
 
@@ -125,7 +127,8 @@ def _body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
 @cache
 def _known_body(legs: int, stroke_rate: float, x64: bool, *constants: Scalar) -> _Body:
     del x64  # part of the cache's key only
-    return _new_body(legs, stroke_rate, *constants)
+    with jax.ensure_compile_time_eval():  # the first to ask may be inside jit
+        return _new_body(legs, stroke_rate, *constants)
 
 
 def _new_body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
@@ -143,25 +146,29 @@ def _new_body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
         qpos = jnp.concatenate([position, quaternion_of(x[:3]), joints])
         return Swimming(qpos, qvel, jnp.zeros((3, 6), x.dtype), jnp.zeros((), x.dtype), x[4:7])
 
-    def step(state: Swimming, control: Array, duration: float = dt) -> Swimming:
-        target = _leg_commands(jnp.clip(control, low, high), legs)
+    def swim(state: Swimming, target: Array, body: Mechanism, *, steps: int) -> Swimming:
+        accelerate = partial(flippers.acceleration, body)
 
         def substep(carry: tuple[Motion, Array, Array], _: None) -> tuple[tuple[Motion, Array, Array], Array]:
             motion, command, stroke = carry
             command = target + keep * (command - target)
-            motion = physics.advance(system, motion, hip_angles(command, stroke))
+            motion = physics.advance(accelerate, motion, hip_angles(command, stroke), tick)
             stroke = stroke + stroke_rate * tick
             return (motion, command, stroke - jnp.floor(stroke)), motion.qvel[3:6]
 
         carry = Motion(state.qpos, state.qvel), state.command, state.stroke
-        (motion, command, stroke), rates = jax.lax.scan(substep, carry, None, length=physics.substeps(system, duration))
+        (motion, command, stroke), rates = jax.lax.scan(substep, carry, None, length=steps)
         return Swimming(*motion, command, stroke, rates[-window:].mean(axis=0))
+
+    def stepping(duration: float) -> Callable[[Swimming, Array], Swimming]:
+        along = batch_last(partial(swim, steps=physics.substeps(system, duration)))
+        return lambda state, control: along(state, _leg_commands(jnp.clip(control, low, high), legs), mechanism(system))
 
     def observe(state: Swimming) -> Array:
         depth, hips = -state.qpos[2:3], state.qpos[HIPS]
         return jnp.concatenate([angles_of(state.qpos[3:7]), depth, state.rate, hips])[:dimensions]
 
-    return _Body(place, step, gliding(partial(step, duration=FRAME), dt), observe, system.host)
+    return _Body(place, stepping(dt), gliding(stepping(FRAME), dt), observe, system.host)
 
 
 def hip_angles(command: Array, stroke: Array) -> Array:

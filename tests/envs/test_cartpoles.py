@@ -1,5 +1,7 @@
 """The cart-poles against the paper's equations, against C MuJoCo and against conservation of energy."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -191,7 +193,8 @@ def test_double_precision_agrees_with_mjx_step():
         motion = physics.Motion(jnp.array([0.1, 2.0, 0.5]), jnp.array([0.3, -1.0, 2.0]))
         data = system.blank.replace(qpos=motion.qpos, qvel=motion.qvel, ctrl=jnp.array([7.0]))
         theirs = jax.jit(lambda data: mjx.step(system.device, data))(data)
-        ours = jax.jit(lambda motion: physics.advance(system, motion, jnp.array([7.0])))(motion)
+        accelerate = partial(physics.acceleration, system)
+        ours = jax.jit(lambda motion: physics.advance(accelerate, motion, jnp.array([7.0]), 0.0025))(motion)
         np.testing.assert_allclose(ours.qpos, theirs.qpos, rtol=1e-13)
         np.testing.assert_allclose(ours.qvel, theirs.qvel, rtol=1e-13)
 
