@@ -188,9 +188,8 @@ def test_a_speed_without_bounds_stays_finite(made_up):
     model, belief = mechanism(), jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), made_up)
 
     def far(x):
-        for _ in range(30):
-            x = x + model.apply(belief, [None, jnp.ones(8)], x, jnp.array([10.0])).mean
-        return x
+        step = lambda x, _: (x + model.apply(belief, [None, jnp.ones(8)], x, jnp.array([10.0])).mean, None)  # noqa: E731
+        return jax.lax.scan(step, x, None, length=30)[0]
 
     end, slope = jax.jit(lambda x: (far(x), jax.jacfwd(far)(x)))(jnp.array([50.0, 300.0, -80.0, 1.0]))
     assert np.all(np.isfinite(end))

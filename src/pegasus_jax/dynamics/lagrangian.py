@@ -14,7 +14,7 @@ from pegasus_jax.whiten import whitener
 # In units of the data's own deviations: the least diagonal of the mass matrix's factor, and the greatest change of a
 # speed in a control period. Where there are no data a mass matrix may be all but singular, and nothing else would keep
 # a particle from going to infinity within one step.
-LEAST_MASS, GREATEST_CHANGE = 0.1, 20.0
+LEAST_MASS, GREATEST_CHANGE, GREATEST_SPEED = 0.1, 20.0, 6.0
 
 
 class Units(NamedTuple):
@@ -118,6 +118,7 @@ def lagrangian(
             third = rate(now + h / 2 * second)
             last = rate(now + h * third)
             now = now + h / 6 * (first + 2 * second + 2 * third + last)
+            now = now.at[1].set(within(now[1], GREATEST_SPEED * units.speed))
         change = jnp.zeros_like(x).at[coordinates].set(now[0] - start[0]).at[rates].set(now[1] - start[1])
         return Prediction(change, head(belief.params["raw_std"]) * units.change)
 
@@ -136,6 +137,11 @@ def lagrangian(
         sample=lambda key, belief: network.sample(key, belief.params["noise"]),
         apply=predict,
     )
+
+
+def within(v: Array, limit: Array) -> Array:
+    """v, all but unchanged below half of the limit and never beyond it; smooth."""
+    return v * (1 + (v / limit) ** 8) ** -0.125
 
 
 def solve(lower: Array, force: Array) -> Array:
