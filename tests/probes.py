@@ -57,7 +57,7 @@ def cart(horizon: int = 8) -> Task:
         control_names=("u",),
         expected_cost=cost.expected_saturating(lambda x: x, 1.0, ()),
         widened=partial(cost.widened, lambda x: x, 1.0, ()),
-        speeds=(1,),
+        rates=(1,),
     )
 
 

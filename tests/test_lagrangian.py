@@ -24,7 +24,7 @@ def mechanism(**changes):
         states=4,
         controls=1,
         angles=(3,),
-        speeds=SPEEDS,
+        rates=SPEEDS,
         dt=0.1,
         substeps=2,
         hidden=(8,),
@@ -169,7 +169,7 @@ def test_a_period_is_one_of_lagranges_equations(made_up):
 
 
 def test_without_forces_energy_stays(made_up):
-    calm = {name: 0 * made_up.params[name] for name in ("control", "constant", "resistance")}
+    calm = {name: np.zeros_like(made_up.params[name]) for name in ("control", "constant", "resistance")}
     belief = made_up._replace(params=made_up.params | calm)
 
     def energy(x):

@@ -71,7 +71,7 @@ def cartpole(
         control_names=("force [N]",),
         model=system.host,
         qpos=lambda motion: motion.qpos,
-        speeds=(1, 2),
+        rates=(1, 2),
     )
 
 

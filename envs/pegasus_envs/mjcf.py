@@ -55,7 +55,7 @@ class Mechanism(NamedTuple):
     control_names: tuple[str, ...]
     model: Any
     qpos: Callable[[Moving], Array]
-    speeds: tuple[int, ...]
+    rates: tuple[int, ...]
 
 
 def mechanism(
@@ -124,7 +124,7 @@ def mechanism(
         control_names=tuple(model.actuator(i).name or f"u{i}" for i in range(model.nu)),
         model=model,
         qpos=lambda state: state.qpos,
-        speeds=_speeds(model, entries),
+        rates=_rates(model, entries),
     )
     try:
         jax.eval_shape(made.step, jax.eval_shape(made.reset, jax.random.key(0)), jnp.zeros(model.nu))
@@ -177,7 +177,7 @@ def _entries(model: mujoco.MjModel, observe: Sequence[str]) -> np.ndarray:
     return np.array(found, int) if found else np.arange(model.nq + model.nv)
 
 
-def _speeds(model: mujoco.MjModel, entries: np.ndarray) -> tuple[int, ...]:
+def _rates(model: mujoco.MjModel, entries: np.ndarray) -> tuple[int, ...]:
     """Which of the observed entries are the others' rates, in their order; () if some have none, as a free joint's."""
     place = {int(entry): i for i, entry in enumerate(entries)}
     partners = [place.get(int(entry) + model.nq) for entry in entries if entry < model.nq]

@@ -275,8 +275,8 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
         case settings.SSGP():
             return ssgp(**shape, points=config.points)
         case settings.Lagrangian():
-            speeds = speeds_of(task)
-            member = lagrangian(**shape, **network_of(config), speeds=speeds, dt=task.dt, substeps=config.substeps)
+            rates = rates_of(task)
+            member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
         case settings.BNN():
             member = bnn(
                 **shape,
@@ -301,15 +301,15 @@ def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
     )
 
 
-def speeds_of(task: Task) -> tuple[int, ...]:
+def rates_of(task: Task) -> tuple[int, ...]:
     """The entries of a task's state that are rates of the others. Raises SettingError where they are not known."""
     states = len(task.state_names)
-    if 2 * len(set(task.speeds)) != states or set(task.speeds) & set(task.angles):
+    if 2 * len(set(task.rates)) != states or set(task.rates) & set(task.angles):
         raise settings.SettingError(
             f"model=lagrangian needs a state of coordinates and their rates, and that of task={task.name} is not known"
             " to be one; the nearest is model=log_normal"
         )
-    return task.speeds
+    return task.rates
 
 
 def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:

@@ -356,7 +356,7 @@ class Config:
     mjcf_digest: str | None = setting(None, "SHA-256 of the compiled mjcf= file; a run notes it, and refuses another")
     cost: str | None = setting(None, "of task=gym|mjcf: module:function, observation [D] -> cost in [0, 1], in JAX")
     angles: tuple[int, ...] = setting((), "of task=gym|mjcf: the entries of the observation that are angles [rad]")
-    speeds: tuple[int, ...] = setting((), "of task=gym: the entries that are the other entries' rates, in their order")
+    rates: tuple[int, ...] = setting((), "of task=gym: the entries that are the other entries' rates, in their order")
     horizon: int | None = setting(None, "of task=gym|mjcf: control periods an episode; null: a gym's own limit")
     dt: float | None = setting(None, "of task=mjcf: control period [s], a whole number of the file's time steps")
     observe: tuple[str, ...] = setting((), "of task=mjcf: as [qpos.0,qvel.1]; []: all positions, then all velocities")
@@ -376,7 +376,7 @@ class Config:
     def __post_init__(self) -> None:
         _choice("legs", self.legs, LEGS)
         _choice("precision", self.precision, PRECISIONS)
-        for name in ("angles", "speeds", "observe", "control_low", "control_high", "start_mean", "start_std"):
+        for name in ("angles", "rates", "observe", "control_low", "control_high", "start_mean", "start_std"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for deviation in self.start_std:
             _within("start_std", deviation, 0)

@@ -40,7 +40,7 @@ def of_plant(name: str, plant: Plant) -> Task:
         dt=plant.dt,
         state_names=plant.state_names,
         control_names=plant.control_names,
-        speeds=plant.speeds,
+        rates=plant.rates,
         expected_cost=expected_saturating(plant.error, plant.width, plant.angles),
         widened=partial(widened, plant.error, plant.width, plant.angles),
     )
@@ -141,7 +141,7 @@ def of_guest(config: Config) -> Task:
     states = tuple(f"x{i}" for i in range(len(plant.start_mean)))
     controls = tuple(f"u{i}" for i in range(len(plant.control_low)))
     task = _of_users(config, config.env, plant, config.horizon or plant.horizon, states, controls)
-    return task._replace(speeds=_entries("speeds", config.speeds, config.env, len(states)))
+    return task._replace(rates=_entries("rates", config.rates, config.env, len(states)))
 
 
 def of_mjcf(config: Config) -> Task:
@@ -161,7 +161,7 @@ def of_mjcf(config: Config) -> Task:
         raise SettingError(f"mjcf={config.mjcf}: {error}") from error
     name = Path(config.mjcf or "").stem
     task = _of_users(config, name, plant, config.horizon or 0, plant.state_names, plant.control_names)
-    return task._replace(speeds=plant.speeds)
+    return task._replace(rates=plant.rates)
 
 
 def _model(config: Config) -> Any:

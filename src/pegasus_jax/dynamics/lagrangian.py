@@ -40,7 +40,7 @@ def lagrangian(
     states: int,
     controls: int,
     angles: tuple[int, ...],
-    speeds: tuple[int, ...],
+    rates: tuple[int, ...],
     dt: float,
     substeps: int,
     head: Head,
@@ -55,11 +55,11 @@ def lagrangian(
         M dv/dt = B u + c - R v - (dM/dt) v + d/dq (v' M v / 2 - V),
 
     integrated over a control period in `substeps` steps (Runge and Kutta's, of fourth order). The noise of the
-    prediction is one std a dimension. `speeds` are the entries of x that are rates of the other entries, in the order
+    prediction is one std a dimension. `rates` are the entries of x that are rates of the other entries, in the order
     of those; `noise` describes the network, as `noisy` has it.
     """
-    coordinates = np.array([i for i in range(states) if i not in speeds])
-    rates = np.array(speeds)
+    coordinates = np.array([i for i in range(states) if i not in rates])
+    moving = np.array(rates)
     n = len(coordinates)
     turning = tuple(i for i, coordinate in enumerate(coordinates) if coordinate in angles)
     rows, columns = np.tril_indices(n)
@@ -80,7 +80,7 @@ def lagrangian(
         return Units(
             centre=jnp.where(turns, 0.0, x.mean[coordinates]),
             spread=jnp.where(turns, 1.0, scale[coordinates]),
-            speed=scale[rates],
+            speed=scale[moving],
             control=jnp.diagonal(u.root),
             change=jnp.diagonal(y.root),
             size=data.size,
@@ -98,10 +98,10 @@ def lagrangian(
         params, units = belief
         (lower, _), along = jax.linearize(lambda q: energies(belief, masks, q), q)
         slopes, pull = jax.vmap(along)(jnp.diag(units.speed * dt))  # [n, n, n], [n]: of L and V by each coordinate
-        moving, momentum = jnp.tensordot(v, slopes, 1), v @ lower  # dL/dt, and L' v
+        change, momentum = jnp.tensordot(v, slopes, 1), v @ lower  # dL/dt, and L' v
         force = params["control"] @ u + params["constant"] - params["resistance"] @ v - pull
-        force += jnp.einsum("ijk,j,k->i", slopes, v, momentum) - moving @ momentum - lower @ (v @ moving)
-        return GREATEST_CHANGE * jnp.tanh(solve(lower, force) / GREATEST_CHANGE)
+        force += jnp.einsum("ijk,j,k->i", slopes, v, momentum) - change @ momentum - lower @ (v @ change)
+        return within(solve(lower, force), GREATEST_CHANGE)
 
     def predict(belief: Belief, masks: Masks, x: Array, u: Array) -> Prediction:
         units, h = belief.units, 1 / substeps
@@ -111,7 +111,7 @@ def lagrangian(
             q, v = state
             return jnp.stack([dt * v, units.speed * acceleration(belief, masks, q, v / units.speed, u)])
 
-        start = now = jnp.stack([x[coordinates], x[rates]])
+        start = now = jnp.stack([x[coordinates], x[moving]])
         for _ in range(substeps):
             first = rate(now)
             second = rate(now + h / 2 * first)
@@ -119,7 +119,7 @@ def lagrangian(
             last = rate(now + h * third)
             now = now + h / 6 * (first + 2 * second + 2 * third + last)
             now = now.at[1].set(within(now[1], GREATEST_SPEED * units.speed))
-        change = jnp.zeros_like(x).at[coordinates].set(now[0] - start[0]).at[rates].set(now[1] - start[1])
+        change = jnp.zeros_like(x).at[coordinates].set(now[0] - start[0]).at[moving].set(now[1] - start[1])
         return Prediction(change, head(belief.params["raw_std"]) * units.change)
 
     def loss(params: Params, key: Key, batch: Batch, units: Units) -> Array:
@@ -139,9 +139,10 @@ def lagrangian(
     )
 
 
-def within(v: Array, limit: Array) -> Array:
+def within(v: Array, limit: Array | float) -> Array:
     """v, all but unchanged below half of the limit and never beyond it; smooth."""
-    return v * (1 + (v / limit) ** 8) ** -0.125
+    ratio = jnp.clip(v / limit, -100.0, 100.0)  # its eighth power exists
+    return limit * ratio * (1 + ratio**8) ** -0.125
 
 
 def solve(lower: Array, force: Array) -> Array:
