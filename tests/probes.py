@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import angles, config, cost, dataset, dropout, scenarios
-from pegasus_jax.dynamics.bnn import HEADS, bnn
+from pegasus_jax.dynamics.bnn import bnn
+from pegasus_jax.noisy import HEADS
 from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.squash import SQUASHES, to_limits
 from pegasus_jax.types import Dynamics, Policy, Prediction, Task, Trajectory
@@ -56,6 +57,7 @@ def cart(horizon: int = 8) -> Task:
         control_names=("u",),
         expected_cost=cost.expected_saturating(lambda x: x, 1.0, ()),
         widened=partial(cost.widened, lambda x: x, 1.0, ()),
+        rates=(1,),
     )
 
 

@@ -10,8 +10,9 @@ import pytest
 from scipy import stats
 
 from pegasus_jax import dropout
-from pegasus_jax.dynamics.bnn import HEADS, bnn
+from pegasus_jax.dynamics.bnn import bnn
 from pegasus_jax.fit import fit, guarded
+from pegasus_jax.noisy import HEADS
 from pegasus_jax.types import Batch, Dataset, Learner
 from probes import experience, network
 

@@ -11,11 +11,11 @@ import pytest
 from pegasus_jax import config, cost, dataset, moments, scenarios, settings, types
 from pegasus_jax.build import AGGREGATES, EXPLORATIONS, build, compose, dropout_of, search_of, start
 from pegasus_jax.config import DROPOUTS, Config, Period, SettingError
-from pegasus_jax.dynamics.bnn import HEADS
 from pegasus_jax.dynamics.gp import gp
 from pegasus_jax.dynamics.ssgp import ssgp
 from pegasus_jax.gaussian import affine
 from pegasus_jax.network import INITIALISERS
+from pegasus_jax.noisy import HEADS
 from pegasus_jax.policy.squash import SQUASHES
 from pegasus_jax.search import objective
 from pegasus_jax.trial import SEARCH, trial_key
@@ -54,13 +54,19 @@ def test_every_dropout_is_the_one_of_its_name(kind):
 @pytest.mark.parametrize("policy", POLICIES)
 def test_every_variant_has_the_shapes_of_the_loop(model, policy):
     """eval_shape traces the loop without compiling it."""
-    exp = compose(settings.parse({"model": model, "policy": policy}), dial())
+    task = cart() if model == "lagrangian" else dial()  # which has no rates
+    exp = compose(settings.parse({"model": model, "policy": policy}), task)
     state = jax.eval_shape(exp.init, jax.random.key(0))
     state = jax.eval_shape(exp.absorb, state, jax.eval_shape(exp.collect, state))
     improved, _ = jax.eval_shape(exp.improve, state)
     assert jax.tree.structure(improved) == jax.tree.structure(state)
     shapes = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)] for tree in (improved, state)]
     assert shapes[0] == shapes[1]
+
+
+def test_a_mechanism_needs_coordinates_and_their_rates():
+    with pytest.raises(SettingError, match=r"model=lagrangian needs .*task=dial.*the nearest is model=log_normal"):
+        compose(settings.parse({"model": "lagrangian"}), dial())
 
 
 @pytest.mark.parametrize(

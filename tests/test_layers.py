@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = {
     0: "types config variants",
     1: "angles mesh dropout whiten moments gaussian cost dataset scenarios rollout episode calibration",
-    2: "network kernel fit lbfgs search pilco",
+    2: "network noisy kernel fit lbfgs search pilco",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",
@@ -37,6 +37,7 @@ SIBLINGS: set[tuple[str, str]] = {
     ("pilco", "search"),  # and one report of how a search went
     ("lbfgs", "fit"),  # what every fit reports
     ("policy.external", "policy.squash"),  # every controller saturates the same ways
+    ("noisy", "network"),  # the one network, with noise on its units
     ("search", "fit"),  # one guarded optimiser, one count of skipped updates
 }
 

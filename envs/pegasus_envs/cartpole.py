@@ -71,6 +71,7 @@ def cartpole(
         control_names=("force [N]",),
         model=system.host,
         qpos=lambda motion: motion.qpos,
+        rates=(1, 2),
     )
 
 

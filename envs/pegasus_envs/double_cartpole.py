@@ -88,6 +88,7 @@ def double_cartpole(
         control_names=("force [N]",),
         model=system.host,
         qpos=lambda motion: motion.qpos,
+        rates=(1, 2, 3),
     )
 
 

@@ -55,6 +55,7 @@ class Mechanism(NamedTuple):
     control_names: tuple[str, ...]
     model: Any
     qpos: Callable[[Moving], Array]
+    rates: tuple[int, ...]
 
 
 def mechanism(
@@ -123,6 +124,7 @@ def mechanism(
         control_names=tuple(model.actuator(i).name or f"u{i}" for i in range(model.nu)),
         model=model,
         qpos=lambda state: state.qpos,
+        rates=_rates(model, entries),
     )
     try:
         jax.eval_shape(made.step, jax.eval_shape(made.reset, jax.random.key(0)), jnp.zeros(model.nu))
@@ -173,6 +175,14 @@ def _entries(model: mujoco.MjModel, observe: Sequence[str]) -> np.ndarray:
             raise ValueError(f"observe={word} is not an entry of its state; choose from {choices}")
         found.append(int(match[2]) + (model.nq if match[1] == "qvel" else 0))
     return np.array(found, int) if found else np.arange(model.nq + model.nv)
+
+
+def _rates(model: mujoco.MjModel, entries: np.ndarray) -> tuple[int, ...]:
+    """Which of the observed entries are the others' rates, in their order; () if some have none, as a free joint's."""
+    place = {int(entry): i for i, entry in enumerate(entries)}
+    partners = [place.get(int(entry) + model.nq) for entry in entries if entry < model.nq]
+    paired = model.nq == model.nv and len(place) == len(entries) == 2 * len(partners)
+    return tuple(i for i in partners if i is not None) if paired and None not in partners else ()
 
 
 def _limits(model: mujoco.MjModel, low: Sequence[float], high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:

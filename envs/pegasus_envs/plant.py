@@ -50,6 +50,8 @@ class Plant(NamedTuple):
     """mujoco.MjModel on the host, to render and to compare; has the default constants where those given are traced"""
     qpos: Callable[[State], Array]
     """state -> MuJoCo's generalised positions [nq]"""
+    rates: tuple[int, ...] = ()
+    """the entries of x that are rates of its other entries, in the order of those; (): x is not made of such pairs"""
 
 
 def saturating(plant: Plant, x: Array) -> Array:

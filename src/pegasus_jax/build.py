@@ -12,13 +12,15 @@ from jax.sharding import Mesh
 from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco, scenarios, tasks, trial
 from pegasus_jax import config as settings
 from pegasus_jax.cost import of_particles
-from pegasus_jax.dynamics.bnn import HEADS, bnn
+from pegasus_jax.dynamics.bnn import bnn
 from pegasus_jax.dynamics.ensemble import ensemble
 from pegasus_jax.dynamics.gp import gp
+from pegasus_jax.dynamics.lagrangian import lagrangian
 from pegasus_jax.dynamics.ssgp import ssgp
 from pegasus_jax.fit import minibatches
 from pegasus_jax.lbfgs import full_data
 from pegasus_jax.mesh import Spread, over_particles, together
+from pegasus_jax.noisy import HEADS
 from pegasus_jax.policy.linear import linear
 from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.rbf import rbf
@@ -264,38 +266,53 @@ def start(key: Key, *, task: Task) -> Array:
     return mean + std * jax.random.normal(key, mean.shape)
 
 
-def dynamics_of(config: settings.BNN | settings.GP | settings.SSGP, task: Task) -> Dynamics:
-    """The configured model of a task's dynamics."""
+def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
+    """The configured model of a task's dynamics. Raises SettingError where the task does not suit it."""
     shape: dict[str, Any] = dict(states=len(task.state_names), controls=len(task.control_names), angles=task.angles)
     match config:
         case settings.GP():
             return gp(**shape, features=config.features)
         case settings.SSGP():
             return ssgp(**shape, points=config.points)
+        case settings.Lagrangian():
+            rates = rates_of(task)
+            member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
         case settings.BNN():
-            return network_of(config, shape)
+            member = bnn(
+                **shape,
+                **network_of(config),
+                input_dropout=dropout_of(config) if config.input_noise else None,
+                heteroscedastic=config.heteroscedastic,
+                full_whitening=config.whitening == "full",
+            )
+    return ensemble(member, config.members) if config.members > 1 else member
 
 
-def network_of(config: settings.BNN, shape: dict[str, Any]) -> Dynamics:
-    """The configured network, or ensemble of networks."""
-    noise = dropout_of(config)
-    member = bnn(
-        **shape,
+def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
+    """What describes the network of a model."""
+    return dict(
         hidden=config.hidden,
-        dropout=noise,
-        input_dropout=noise if config.input_noise else None,
+        dropout=dropout_of(config),
         head=HEADS[config.head],
-        heteroscedastic=config.heteroscedastic,
-        full_whitening=config.whitening == "full",
         kl_weight=config.kl_weight,
         weight_decay=config.weight_decay,
         activation=config.activation,
         initialiser=config.initialiser,
     )
-    return ensemble(member, config.members) if config.members > 1 else member
 
 
-def dropout_of(config: settings.BNN) -> Dropout:
+def rates_of(task: Task) -> tuple[int, ...]:
+    """The entries of a task's state that are rates of the others. Raises SettingError where they are not known."""
+    states = len(task.state_names)
+    if 2 * len(set(task.rates)) != states or set(task.rates) & set(task.angles):
+        raise settings.SettingError(
+            f"model=lagrangian needs a state of coordinates and their rates, and that of task={task.name} is not known"
+            " to be one; the nearest is model=log_normal"
+        )
+    return task.rates
+
+
+def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
     """The configured noise on a model's units. Raises SettingError for parameters it cannot have."""
     try:
         return _dropout_of(config)
@@ -303,7 +320,7 @@ def dropout_of(config: settings.BNN) -> Dropout:
         raise settings.SettingError(f"model.dropout={config.dropout}: {error}") from error
 
 
-def _dropout_of(config: settings.BNN) -> Dropout:
+def _dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
     match config.dropout:
         case "log_normal":
             return dropout.log_normal(config.low, config.high)

@@ -78,34 +78,30 @@ PRECISIONS = ("single", "double")
 
 
 @dataclass(frozen=True)
-class BNN:
-    """Bayesian neural network dynamics, or an ensemble of them."""
+class _Network:
+    """What every network model has, and an ensemble of them."""
 
-    kind: str = setting("bnn", "")
+    kind: str = setting("", "")
     members: int = setting(1, "networks fitted side by side; each particle follows one of them")
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
     rate: float = setting(0.1, "drop probability of binary dropout, initial one of concrete dropout")
     low: float = setting(-10.0, "lower end of the interval of log z (log_normal)")
     high: float = setting(0.0, "upper end of the interval of log z (log_normal)")
-    input_noise: bool = setting(False, "noise on the network's own inputs as well")
-    heteroscedastic: bool = setting(True, "predicted noise depends on the input")
     head: str = setting("sigmoid", "form of the predicted noise: sigmoid (at most .1 of the target's scale), softplus")
-    whitening: str = setting("full", "scaling of inputs and targets: full covariance, or diagonal")
     kl_weight: float = setting(0.1, "factor of the noise's KL divergence; 1 is the variational bound")
     weight_decay: float = setting(1.0, "factor of the Gaussian prior on the weights")
     activation: str = setting("silu", "nonlinearity: relu, silu, tanh")
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
-        _kind("model", self.kind, "bnn")
+        _kind("model", self.kind, type(self).kind)
         _within("model.members", self.members, 1)
         object.__setattr__(self, "hidden", _layers("model.hidden", self.hidden))
         _choice("model.activation", self.activation, ACTIVATIONS)
         _within("model.kl_weight", self.kl_weight, 0)
         _choice("model.dropout", self.dropout, DROPOUTS)
         _choice("model.head", self.head, HEADS)
-        _choice("model.whitening", self.whitening, ("full", "diagonal"))
         _choice("model.initialiser", self.initialiser, INITIALISERS)
         _within("model.rate", self.rate, 0, 0.99)
         _within("model.weight_decay", self.weight_decay, 0)
@@ -113,6 +109,33 @@ class BNN:
         _within("model.high", self.high, -math.inf)
         if not self.low < self.high:
             raise SettingError(f"model.low={self.low:g} must be less than model.high={self.high:g}")
+
+
+@dataclass(frozen=True)
+class BNN(_Network):
+    """Bayesian neural network dynamics, or an ensemble of them."""
+
+    kind: str = setting("bnn", "")
+    input_noise: bool = setting(False, "noise on the network's own inputs as well")
+    heteroscedastic: bool = setting(True, "predicted noise depends on the input")
+    whitening: str = setting("full", "scaling of inputs and targets: full covariance, or diagonal")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _choice("model.whitening", self.whitening, ("full", "diagonal"))
+
+
+@dataclass(frozen=True)
+class Lagrangian(_Network):
+    """Dynamics of a mechanism whose energies are a Bayesian neural network, or an ensemble of them."""
+
+    kind: str = setting("lagrangian", "")
+    hidden: tuple[int, ...] = setting((32, 32), "widths of the hidden layers")
+    substeps: int = setting(2, "Runge-Kutta steps a control period")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _within("model.substeps", self.substeps, 1)
 
 
 @dataclass(frozen=True)
@@ -319,6 +342,9 @@ class Explore:
         _choice("explore.kind", self.kind, EXPLORATIONS)
 
 
+Model = BNN | GP | SSGP | Lagrangian
+
+
 @dataclass(frozen=True)
 class Config:
     """One run."""
@@ -330,6 +356,7 @@ class Config:
     mjcf_digest: str | None = setting(None, "SHA-256 of the compiled mjcf= file; a run notes it, and refuses another")
     cost: str | None = setting(None, "of task=gym|mjcf: module:function, observation [D] -> cost in [0, 1], in JAX")
     angles: tuple[int, ...] = setting((), "of task=gym|mjcf: the entries of the observation that are angles [rad]")
+    rates: tuple[int, ...] = setting((), "of task=gym: the entries that are the other entries' rates, in their order")
     horizon: int | None = setting(None, "of task=gym|mjcf: control periods an episode; null: a gym's own limit")
     dt: float | None = setting(None, "of task=mjcf: control period [s], a whole number of the file's time steps")
     observe: tuple[str, ...] = setting((), "of task=mjcf: as [qpos.0,qvel.1]; []: all positions, then all velocities")
@@ -340,7 +367,7 @@ class Config:
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
     precision: str = setting("single", "of all numbers: single (32 bits) or double (64)")
-    model: BNN | GP | SSGP = BNN()
+    model: Model = BNN()
     policy: MLP | RBF | Linear = MLP()
     fit: Fit | LBFGS = Fit()
     search: Search | Analytic = Search()
@@ -349,7 +376,7 @@ class Config:
     def __post_init__(self) -> None:
         _choice("legs", self.legs, LEGS)
         _choice("precision", self.precision, PRECISIONS)
-        for name in ("angles", "observe", "control_low", "control_high", "start_mean", "start_std"):
+        for name in ("angles", "rates", "observe", "control_low", "control_high", "start_mean", "start_std"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for deviation in self.start_std:
             _within("start_std", deviation, 0)

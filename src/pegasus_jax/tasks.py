@@ -40,6 +40,7 @@ def of_plant(name: str, plant: Plant) -> Task:
         dt=plant.dt,
         state_names=plant.state_names,
         control_names=plant.control_names,
+        rates=plant.rates,
         expected_cost=expected_saturating(plant.error, plant.width, plant.angles),
         widened=partial(widened, plant.error, plant.width, plant.angles),
     )
@@ -139,7 +140,8 @@ def of_guest(config: Config) -> Task:
         raise SettingError(f"env={config.env}: {error}") from error
     states = tuple(f"x{i}" for i in range(len(plant.start_mean)))
     controls = tuple(f"u{i}" for i in range(len(plant.control_low)))
-    return _of_users(config, config.env, plant, config.horizon or plant.horizon, states, controls)
+    task = _of_users(config, config.env, plant, config.horizon or plant.horizon, states, controls)
+    return task._replace(rates=_entries("rates", config.rates, config.env, len(states)))
 
 
 def of_mjcf(config: Config) -> Task:
@@ -158,7 +160,8 @@ def of_mjcf(config: Config) -> Task:
     except ValueError as error:
         raise SettingError(f"mjcf={config.mjcf}: {error}") from error
     name = Path(config.mjcf or "").stem
-    return _of_users(config, name, plant, config.horizon or 0, plant.state_names, plant.control_names)
+    task = _of_users(config, name, plant, config.horizon or 0, plant.state_names, plant.control_names)
+    return task._replace(rates=plant.rates)
 
 
 def _model(config: Config) -> Any:
@@ -172,16 +175,11 @@ def _of_users(
     config: Config, name: str, plant: Any, horizon: int, states: tuple[str, ...], controls: tuple[str, ...]
 ) -> Task:
     """The task that a user's plant poses with the cost and the angles that the config names."""
-    for angle in config.angles:
-        if not 0 <= angle < len(states):
-            raise SettingError(
-                f"angles={angle} is not an entry of {name}'s observation; choose from 0 to {len(states) - 1}"
-            )
     return Task(
         name=name,
         plant=plant,
         cost=_function(config.cost or ""),
-        angles=config.angles,
+        angles=_entries("angles", config.angles, name, len(states)),
         start_mean=plant.start_mean,
         start_std=plant.start_std,
         sensor_std=np.zeros(len(states)),
@@ -192,6 +190,16 @@ def _of_users(
         state_names=states,
         control_names=controls,
     )
+
+
+def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> tuple[int, ...]:
+    """The entries, if they are ones of the observation."""
+    for entry in entries:
+        if not 0 <= entry < states:
+            raise SettingError(
+                f"{setting}={entry} is not an entry of {name}'s observation; choose from 0 to {states - 1}"
+            )
+    return entries
 
 
 def _function(name: str) -> Callable[[Any], Any]:

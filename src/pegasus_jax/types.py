@@ -131,6 +131,8 @@ class Task(NamedTuple):
     dt: float  # [s] control period
     state_names: tuple[str, ...]
     control_names: tuple[str, ...]
+    # The entries of x that are rates of its other entries, in the order of those; (): x is not made of such pairs.
+    rates: tuple[int, ...] = ()
     success: float = 0.2  # a rollout whose last five steps cost less than this on average has succeeded
     # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not known in closed form
     expected_cost: Callable[[Array, Array], Array] | None = None

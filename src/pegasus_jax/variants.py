@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from pegasus_jax.config import BNN, GP, LBFGS, MLP, RBF, SSGP, Analytic, Fit, Linear, Search
+from pegasus_jax.config import BNN, GP, LBFGS, MLP, RBF, SSGP, Analytic, Fit, Lagrangian, Linear, Search
 
 # The named variants that `model=`, `policy=` and `algorithm=` select: what each changes in the defaults, whole sections
 # first. A dotted change counts only where the chosen sections have such a setting.
@@ -14,7 +14,13 @@ MODELS: dict[str, dict[str, Any]] = {
     "sparse": {"model": BNN(dropout="sparse")},
     "deterministic": {"model": BNN(dropout="none")},
     "ensemble": {"model": BNN(dropout="none", members=5)},
-    # The number of steps once more, because a task's own is meant for minibatches.
+    # Widths and numbers of steps once more, because a task's own are meant for the network of the paper.
+    "lagrangian": {
+        "model": Lagrangian(),
+        "model.hidden": Lagrangian.hidden,
+        "fit.steps": 3000,
+        "fit.learning_rate": 3e-3,
+    },
     "gp": {"model": GP(), "fit": LBFGS(starts=10), "fit.steps": 300},
     "ssgp": {"model": SSGP(), "fit": LBFGS(), "fit.steps": 300},
 }
@@ -63,7 +69,7 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
 
 # What each section can be, by the kind that a stored config names.
 KINDS: dict[str, dict[str, Any]] = {
-    "model": {"bnn": BNN(), "gp": GP(), "ssgp": SSGP()},
+    "model": {"bnn": BNN(), "gp": GP(), "ssgp": SSGP(), "lagrangian": Lagrangian()},
     "policy": {"mlp": MLP(), "rbf": RBF(), "linear": Linear()},
     "fit": {"adam": Fit(), "lbfgs": LBFGS()},
     "search": {"particles": Search(), "analytic": Analytic()},

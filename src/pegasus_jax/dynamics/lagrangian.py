@@ -1,0 +1,157 @@
+"""A mechanism whose energies are a Bayesian network: Lagrange's equations, integrated (after Lutter et al. 2019)."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax.angles import encode
+from pegasus_jax.noisy import Head, Masks, misfit, noisy
+from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
+from pegasus_jax.whiten import whitener
+
+# In units of the data's own deviations: the least diagonal of the mass matrix's factor, and the greatest change of a
+# speed in a control period. Where there are no data a mass matrix may be all but singular, and nothing else would keep
+# a particle from going to infinity within one step.
+LEAST_MASS, GREATEST_CHANGE, GREATEST_SPEED = 0.1, 20.0, 6.0
+
+
+class Units(NamedTuple):
+    """What makes the numbers of a mechanism of order one; from the data as a whole."""
+
+    centre: Array  # [n] mean of the coordinates; 0 of angles
+    spread: Array  # [n] their deviation; 1 of angles
+    speed: Array  # [n] deviation of the speeds
+    control: Array  # [U] deviation of the controls
+    change: Array  # [D] deviation of a period's change of state
+    size: Array  # [] rows these come from
+
+
+class Belief(NamedTuple):
+    """A fitted mechanism."""
+
+    params: Params
+    units: Units
+
+
+def lagrangian(
+    *,
+    states: int,
+    controls: int,
+    angles: tuple[int, ...],
+    rates: tuple[int, ...],
+    dt: float,
+    substeps: int,
+    head: Head,
+    weight_decay: float = 1.0,
+    **noise: Any,
+) -> Dynamics:
+    """A distribution over mechanisms with n = D / 2 generalised coordinates q and their speeds v, in any order in x.
+
+    A network with noise on its units says, of q alone, the lower triangular root L of the mass matrix and the
+    potential V; M = L L'. With constants B, c and R beside it, and all in the data's units,
+
+        M dv/dt = B u + c - R v - (dM/dt) v + d/dq (v' M v / 2 - V),
+
+    integrated over a control period in `substeps` steps (Runge and Kutta's, of fourth order). The noise of the
+    prediction is one std a dimension. `rates` are the entries of x that are rates of the other entries, in the order
+    of those; `noise` describes the network, as `noisy` has it.
+    """
+    coordinates = np.array([i for i in range(states) if i not in rates])
+    moving = np.array(rates)
+    n = len(coordinates)
+    turning = tuple(i for i, coordinate in enumerate(coordinates) if coordinate in angles)
+    rows, columns = np.tril_indices(n)
+    network = noisy(features=n + len(turning), outputs=len(rows) + 1, weight_decay=weight_decay, **noise)
+
+    def init(key: Key) -> Params:
+        net_key, control_key = jax.random.split(key)
+        return network.init(net_key) | {
+            "control": 0.5 * jax.random.normal(control_key, (n, controls)),
+            "constant": jnp.zeros(n),
+            "resistance": jnp.zeros((n, n)),
+            "raw_std": jnp.zeros(states),
+        }
+
+    def prepare(data: Dataset) -> Units:
+        x, u, y = (whitener(rows, data.size, full=False) for rows in (data.x, data.u, data.y))
+        scale, turns = jnp.diagonal(x.root), np.isin(coordinates, angles)
+        return Units(
+            centre=jnp.where(turns, 0.0, x.mean[coordinates]),
+            spread=jnp.where(turns, 1.0, scale[coordinates]),
+            speed=scale[moving],
+            control=jnp.diagonal(u.root),
+            change=jnp.diagonal(y.root),
+            size=data.size,
+        )
+
+    def energies(belief: Belief, masks: Masks, q: Array) -> tuple[Array, Array]:
+        """L [n, n] and V [] at q [n]."""
+        features = encode((q - belief.units.centre) / belief.units.spread, turning)
+        out = network.apply(belief.params["network"], features, masks)
+        lower = jnp.zeros((n, n), out.dtype).at[rows, columns].set(out[:-1])
+        return jnp.tril(lower, -1) + jnp.diag(LEAST_MASS + jax.nn.softplus(1 + jnp.diagonal(lower))), out[-1]
+
+    def acceleration(belief: Belief, masks: Masks, q: Array, v: Array, u: Array) -> Array:
+        """Change of v [n] in a control period; v and u [U] in their units."""
+        params, units = belief
+        (lower, _), along = jax.linearize(lambda q: energies(belief, masks, q), q)
+        slopes, pull = jax.vmap(along)(jnp.diag(units.speed * dt))  # [n, n, n], [n]: of L and V by each coordinate
+        change, momentum = jnp.tensordot(v, slopes, 1), v @ lower  # dL/dt, and L' v
+        force = params["control"] @ u + params["constant"] - params["resistance"] @ v - pull
+        force += jnp.einsum("ijk,j,k->i", slopes, v, momentum) - change @ momentum - lower @ (v @ change)
+        return within(solve(lower, force), GREATEST_CHANGE)
+
+    def predict(belief: Belief, masks: Masks, x: Array, u: Array) -> Prediction:
+        units, h = belief.units, 1 / substeps
+        u = u / units.control
+
+        def rate(state: Array) -> Array:
+            q, v = state
+            return jnp.stack([dt * v, units.speed * acceleration(belief, masks, q, v / units.speed, u)])
+
+        start = now = jnp.stack([x[coordinates], x[moving]])
+        for _ in range(substeps):
+            first = rate(now)
+            second = rate(now + h / 2 * first)
+            third = rate(now + h / 2 * second)
+            last = rate(now + h * third)
+            now = now + h / 6 * (first + 2 * second + 2 * third + last)
+            now = now.at[1].set(within(now[1], GREATEST_SPEED * units.speed))
+        change = jnp.zeros_like(x).at[coordinates].set(now[0] - start[0]).at[moving].set(now[1] - start[1])
+        return Prediction(change, head(belief.params["raw_std"]) * units.change)
+
+    def loss(params: Params, key: Key, batch: Batch, units: Units) -> Array:
+        """Eq. 2 divided by N, with fresh noise for every row; the constants have the weights' prior."""
+        masks = network.sample_rows(key, params["noise"], batch.x.shape[0])
+        predicted = jax.vmap(lambda masks, x, u: predict(Belief(params, units), masks, x, u))(masks, batch.x, batch.u)
+        prior = weight_decay / 2 * sum(jnp.sum(params[name] ** 2) for name in ("control", "constant", "resistance"))
+        return misfit(predicted, batch.y) + (network.penalty(params) + prior) / units.size
+
+    return Dynamics(
+        init=init,
+        prepare=prepare,
+        loss=loss,
+        condition=lambda params, data: Belief(params, prepare(data)),
+        sample=lambda key, belief: network.sample(key, belief.params["noise"]),
+        apply=predict,
+    )
+
+
+def within(v: Array, limit: Array | float) -> Array:
+    """v, all but unchanged below half of the limit and never beyond it; smooth."""
+    ratio = jnp.clip(v / limit, -100.0, 100.0)  # its eighth power exists
+    return limit * ratio * (1 + ratio**8) ** -0.125
+
+
+def solve(lower: Array, force: Array) -> Array:
+    """a [n] with L L' a = force; unrolled, because for a few coordinates a library call costs more than the network."""
+    n = force.shape[0]
+    half: list[Array] = []
+    for i in range(n):
+        half.append((force[i] - sum(lower[i, j] * half[j] for j in range(i))) / lower[i, i])
+    whole: dict[int, Array] = {}
+    for i in reversed(range(n)):
+        whole[i] = (half[i] - sum(lower[j, i] * whole[j] for j in range(i + 1, n))) / lower[i, i]
+    return jnp.stack([whole[i] for i in range(n)])
