@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax import config, cost, dataset, moments, scenarios, settings, types
+from pegasus_jax import config, cost, dataset, moments, scenarios, settings, tasks, types
 from pegasus_jax.build import AGGREGATES, EXPLORATIONS, build, compose, dropout_of, search_of, start
 from pegasus_jax.config import DROPOUTS, Config, Period, SettingError
 from pegasus_jax.dynamics.gp import gp
@@ -67,6 +67,19 @@ def test_every_variant_has_the_shapes_of_the_loop(model, policy):
 def test_a_mechanism_needs_coordinates_and_their_rates():
     with pytest.raises(SettingError, match=r"model=lagrangian needs .*task=dial.*the nearest is model=log_normal"):
         compose(settings.parse({"model": "lagrangian"}), dial())
+
+
+def test_the_rates_of_a_gym_are_named_and_checked():
+    words = {"task": "gym", "env": "InvertedPendulum-v5", "cost": "math:cos", "model": "lagrangian", "angles": "[1]"}
+    compose(known := settings.parse(words | {"rates": "[2,3]"}), tasks.of_config(known))
+    for rates, expected in (
+        ("[2,9]", "rates=9 is not an entry"),
+        ("[1,2]", "model=lagrangian needs"),
+        ("[2]", "needs"),
+    ):
+        wrong = settings.parse(words | {"rates": rates})
+        with pytest.raises(SettingError, match=expected):
+            compose(wrong, tasks.of_config(wrong))
 
 
 @pytest.mark.parametrize(

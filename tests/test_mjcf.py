@@ -70,6 +70,8 @@ def test_what_is_observed_is_placed(pendulum: mjcf.Mechanism) -> None:
     assert some.state_names == ("hinge' [rad/s]", "hinge [rad]")
     assert pendulum.state_names == ("slider [m]", "hinge [rad]", "slider' [m/s]", "hinge' [rad/s]")
     np.testing.assert_allclose((some.control_low, some.control_high), ([-3.0], [3.0]))
+    assert (pendulum.rates, some.rates) == ((2, 3), (0,))
+    assert mjcf.mechanism(pendulum.model, 0.04, observe=["qpos.0", "qpos.1", "qvel.1"]).rates == ()
     narrow = mjcf.mechanism(pendulum.model, 0.04, control_low=[-1.0], control_high=[0.5])
     np.testing.assert_allclose((narrow.control_low, narrow.control_high), ([-1.0], [0.5]))
 
