@@ -46,8 +46,8 @@ def test_a_seed_among_others_leaves_what_it_leaves_alone(study: Path, tmp_path: 
         assert one is not None
         assert other is not None
         for a, b in zip(one, other, strict=True):
-            # Rounding, amplified by the plant: at an episode's end the pole turns at ten radians a second.
-            np.testing.assert_allclose(a, b, rtol=1e-3, atol=2e-3)
+            # Rounding, amplified by learning and the plant; forces are up to 10 N, the pole turns at ten radians a second.
+            np.testing.assert_allclose(a, b, rtol=1e-3, atol=5e-3)
     for a, b in zip(record.trials(alone), record.trials(among), strict=True):
         assert a.keys() == b.keys()
         for name in ("mean_cost", "objective_first", "objective_last", "objective_fresh"):
