@@ -46,7 +46,7 @@ def test_a_seed_among_others_leaves_what_it_leaves_alone(study: Path, tmp_path: 
         assert one is not None
         assert other is not None
         for a, b in zip(one, other, strict=True):
-            # Rounding, amplified by learning and the plant; forces are up to 10 N, the pole turns at ten radians a second.
+            # Rounding, amplified by learning and by the plant: forces are up to 10 N, rates up to ten radians a second.
             np.testing.assert_allclose(a, b, rtol=1e-3, atol=5e-3)
     for a, b in zip(record.trials(alone), record.trials(among), strict=True):
         assert a.keys() == b.keys()
