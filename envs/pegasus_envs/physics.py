@@ -1,9 +1,10 @@
-"""Smooth rigid-body physics by MJX: one evaluation of the acceleration, a Runge-Kutta step around it.
+"""Smooth rigid-body physics: one evaluation of the acceleration, MJX's, and a Runge-Kutta step around any.
 
 `mjx.step` with RK4 evaluates `mjx.forward` four times in the compiled program, each with every feature of MuJoCo; for
 a small mechanism the compiler then works far longer than the simulation. Here the four stages are a loop around one
-evaluation, which calls only the passes that a mechanism without contacts, constraints, tendons or activation states
-needs. The physics is MJX's own, and tests hold it to `mjx.step` and to C MuJoCo.
+evaluation, which calls only the passes that a mechanism without contacts, constraints, tendons, springs, fluid or
+activation states needs. The physics is MJX's own, and tests hold it to `mjx.step` and to C MuJoCo. The swimmer
+takes the same steps with equations of motion of its own (`flippers`).
 """
 
 # pyright: reportAttributeAccessIssue=false

@@ -1,5 +1,6 @@
 """A network with multiplicative noise on its units, and what eq. 2 charges for its weights and for that noise."""
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -25,8 +26,8 @@ class Noisy(NamedTuple):
 
     init: Callable[[Key], dict[str, Params]]
     apply: Callable[[Params, Array, Masks], Any]  # (weights, inputs [..., F], masks) -> outputs [..., O]
-    sample: Callable[[Key, Params], Masks]  # (key, noise) -> masks of one network
-    sample_rows: Callable[[Key, Params, int], Masks]  # the same of one network a row: masks [M, width]
+    # (key, noise) -> masks [width] of one network; (key, noise, M) -> masks [M, width] of one a row
+    sample: Callable[..., Masks]
     penalty: Callable[[dict[str, Params]], Array]  # KL of the noise + weight prior (docs/reference.md 4.4) [nats]
 
 
@@ -55,22 +56,14 @@ def noisy(
         noise = tuple(k.init(kk, w) if k else {} for k, kk, w in zip(kinds, keys, widths, strict=True))
         return {"network": network.init(net_key, jnp.zeros(features), [None] * len(kinds)), "noise": noise}
 
-    def masks_of(params: Params, noise: tuple) -> Masks:
-        return [k.mask(p, z) if k else None for k, p, z in zip(kinds, params, noise, strict=True)]
-
-    def sample(key: Key, params: Params) -> Masks:
-        keys = jax.random.split(key, len(kinds))
-        return masks_of(
-            params, tuple(k.sample(kk, w) if k else None for k, kk, w in zip(kinds, keys, widths, strict=True))
-        )
-
-    def sample_rows(key: Key, params: Params, rows: int) -> Masks:
+    def sample(key: Key, params: Params, *rows: int) -> Masks:
         keys = jax.random.split(key, len(kinds))
         # Base noise is independent over units, so that of M rows is that of one layer M times as wide.
         noise = tuple(
-            k.sample(kk, rows * w).reshape(rows, w) if k else None for k, kk, w in zip(kinds, keys, widths, strict=True)
+            k.sample(kk, math.prod(rows) * w).reshape(*rows, w) if k else None
+            for k, kk, w in zip(kinds, keys, widths, strict=True)
         )
-        return masks_of(params, noise)
+        return [k.mask(p, z) if k else None for k, p, z in zip(kinds, params, noise, strict=True)]
 
     def penalty(params: dict[str, Params]) -> Array:
         kl = sum(k.kl(p) for k, p in zip(kinds, params["noise"], strict=True) if k)
@@ -81,7 +74,7 @@ def noisy(
             prior += 0.5 * jnp.sum(retained * jnp.sum(layer["kernel"] ** 2, 1)) + 0.5 * jnp.sum(layer["bias"] ** 2)
         return kl_weight * kl + weight_decay * prior
 
-    return Noisy(init, network.apply, sample, sample_rows, penalty)
+    return Noisy(init, network.apply, sample, penalty)
 
 
 def misfit(predicted: Prediction, y: Array) -> Array:

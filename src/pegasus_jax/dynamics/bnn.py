@@ -41,8 +41,8 @@ def bnn(
 ) -> Dynamics:
     """A BNN over (encoded state, control) -> change of state [D], with its noise std [D].
 
-    With `heteroscedastic` the noise std is a function of the input, otherwise one vector of parameters. `noise` and
-    the rest describe the network, as `noisy` has them.
+    With `heteroscedastic` the noise std is a function of the input, otherwise one vector of parameters. `hidden`,
+    `input_dropout` and `noise` describe the network, as `noisy` has them.
     """
     features = states + len(angles) + controls
     outputs = states * (2 if heteroscedastic else 1)
@@ -84,7 +84,7 @@ def bnn(
 
     def loss(params: Params, key: Key, batch: Batch, scaling: Scaling) -> Array:
         """Eq. 2 divided by N, with fresh noise for every row."""
-        masks = network.sample_rows(key, params["noise"], batch.x.shape[0])
+        masks = network.sample(key, params["noise"], batch.x.shape[0])
         predicted = predict(believe(params, scaling), masks, batch.x, batch.u)
         return misfit(predicted, batch.y) + network.penalty(params) / scaling.size
 

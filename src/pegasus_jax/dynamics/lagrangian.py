@@ -124,7 +124,7 @@ def lagrangian(
 
     def loss(params: Params, key: Key, batch: Batch, units: Units) -> Array:
         """Eq. 2 divided by N, with fresh noise for every row; the constants have the weights' prior."""
-        masks = network.sample_rows(key, params["noise"], batch.x.shape[0])
+        masks = network.sample(key, params["noise"], batch.x.shape[0])
         predicted = jax.vmap(lambda masks, x, u: predict(Belief(params, units), masks, x, u))(masks, batch.x, batch.u)
         prior = weight_decay / 2 * sum(jnp.sum(params[name] ** 2) for name in ("control", "constant", "resistance"))
         return misfit(predicted, batch.y) + (network.penalty(params) + prior) / units.size
