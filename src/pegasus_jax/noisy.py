@@ -58,12 +58,12 @@ def noisy(
 
     def sample(key: Key, params: Params, *rows: int) -> Masks:
         keys = jax.random.split(key, len(kinds))
-        # Base noise is independent over units, so that of M rows is that of one layer M times as wide.
-        noise = tuple(
-            k.sample(kk, math.prod(rows) * w).reshape(*rows, w) if k else None
-            for k, kk, w in zip(kinds, keys, widths, strict=True)
-        )
-        return [k.mask(p, z) if k else None for k, p, z in zip(kinds, params, noise, strict=True)]
+
+        def mask(kind: Dropout | None, params: Params, key: Key, width: int) -> Array | None:
+            # Base noise is independent over units, so that of M rows is that of one layer M times as wide.
+            return kind.mask(params, kind.sample(key, math.prod(rows) * width).reshape(*rows, width)) if kind else None
+
+        return [mask(*layer) for layer in zip(kinds, params, keys, widths, strict=True)]
 
     def penalty(params: dict[str, Params]) -> Array:
         kl = sum(k.kl(p) for k, p in zip(kinds, params["noise"], strict=True) if k)
