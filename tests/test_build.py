@@ -213,6 +213,14 @@ def test_truncation_reaches_the_gradient_and_only_that():
     assert abs(plain.gradient_norm[0] - truncated.gradient_norm[0]) > 1e-3
 
 
+def test_a_limit_reaches_the_gradient_as_a_share_of_each_particle():
+    (_, state, run), (_, _, limited), (_, _, loose) = searcher(), searcher(limit=1e-3), searcher(limit=1e6)
+    plain, short, same = (f(state)[1] for f in (run, limited, loose))
+    assert plain.objective[0] == short.objective[0]
+    assert short.gradient_norm[0] < 0.9 * plain.gradient_norm[0]
+    np.testing.assert_allclose(same.gradient_norm[0], plain.gradient_norm[0], rtol=1e-5)
+
+
 def test_the_best_parameters_of_a_search_reach_the_policy():
     """One step: they are those it began with, while the last are one step further."""
     moved, kept = (searcher(best=best) for best in (False, True))

@@ -27,12 +27,14 @@ SMALL = {
     "model.members": "2",
     "model.features": "6",
     "model.points": "4",
+    "model.substeps": "1",
     "policy.hidden": "[8]",
     "policy.units": "5",
     "fit.steps": "2",
     "fit.starts": "2",
     "search.steps": "2",
     "search.particles": "6",
+    "search.restart": "false",  # test_trial.py has it; here it would be half of each program to compile
     "trials": "3",
 }
 PIECES = [policy for policy in POLICIES if policy != "rbf100"]  # which is rbf with more units

@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pegasus_jax import moments
-from pegasus_jax.rollout import NoiseUse, rollout
+from pegasus_jax.rollout import NoiseUse, limited, rollout
 from pegasus_jax.scenarios import draw
 from pegasus_jax.types import Dynamics, Period, Policy, Prediction, Scenarios
-from probes import PENDULUM, known, linear_policy, rig
+from probes import PENDULUM, Linear, known, linear_policy, rig
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
@@ -232,3 +232,47 @@ def test_truncation_is_the_gradient_with_states_held_at_the_cuts(truncate, x64):
 
 def test_a_cut_beyond_the_horizon_cuts_nothing(x64):
     np.testing.assert_allclose(truncated(6)[1], truncated(None)[1], rtol=1e-12)
+
+
+# The limit of a particle's gradient
+
+
+def limited_at(start, limit, match=moments.keep):
+    """(states, gradient by the gain) of a plant that doubles its state each step, 12 steps, from start [K, 1]."""
+    one = np.eye(1)
+    dynamics, policy = known(Linear(2 * one, one, one, np.zeros(1), np.ones(1), 12)), linear_policy(1, 1)
+    none, k = jnp.zeros((12, len(start), 1)), len(start)
+    given = Scenarios(jnp.asarray(start), jnp.zeros(k), jnp.zeros(k), none, none)
+
+    def value(gain):
+        x = rollout(gain, None, given, dynamics=dynamics, policy=policy, match=match, limit=limit).x
+        return jnp.mean(x[1:]), x
+
+    gradient, x = jax.jit(jax.grad(value, has_aux=True))(jnp.zeros((1, 1)))
+    return np.asarray(x), np.asarray(gradient)
+
+
+def test_a_limit_beyond_every_gradient_changes_nothing(x64):
+    free, limited = limited_at([[1.0], [-3.0]], None), limited_at([[1.0], [-3.0]], 1e9)
+    np.testing.assert_allclose(limited[1], free[1], rtol=1e-12)
+
+
+def test_a_limit_holds_what_goes_back_through_each_state(x64):
+    """By hand: dx[t+1]/dgain = x[t], and what comes back to x[t+1] is its own 1 / 12 K and the limited rest."""
+    start, limit = np.array([[1.0], [-3.0]]), 0.1
+    x, gradient = limited_at(start, limit)
+    np.testing.assert_array_equal(x, limited_at(start, None)[0])  # what is imagined does not change
+    back, total = 0.0, 0.0
+    for t in reversed(range(12)):
+        whole = 1 / 24 + back
+        total += whole * x[t].sum()
+        back = min(2 * whole, limit)
+    np.testing.assert_allclose(gradient, [[total]], rtol=1e-12)
+    assert back == limit
+
+
+def test_a_particle_whose_gradient_overflows_does_not_silence_the_others():
+    """Gradients of 1e30 have squares that float32 does not hold."""
+    scale = jnp.array([[1.0], [1e30]])
+    gradient = jax.grad(lambda x: jnp.sum(scale * limited(x, 0.5)))(jnp.ones((2, 1)))
+    assert gradient.tolist() == [[0.5], [0.0]]

@@ -76,6 +76,18 @@ def test_a_run_leaves_everything(whole: Path) -> None:
     assert "jax" in about["versions"]
 
 
+def test_nothing_is_learned_between_random_episodes(tmp_path: Path) -> None:
+    run = tmp_path / "run"
+    done = call("train", *TINY, "explore.trials=2", f"out={run}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = record.trials(run)
+    assert [row["fit_loss"] is None for row in rows] == [True, False, False]
+    assert [row["objective_last"] is None for row in rows] == [True, False, False]
+    assert [row["calibration"] is None for row in rows] == [True, True, False]
+    assert [path.stem for path in sorted((run / "imagined").iterdir())] == ["0002", "0003"]
+    assert call("plot", run, cwd=tmp_path).returncode == 0
+
+
 def test_episodes_can_be_read_without_us(whole: Path) -> None:
     with np.load(whole / "episodes" / "0002.npz") as file:
         assert file["x"].shape == (26, 4)

@@ -296,3 +296,19 @@ def test_a_search_starts_from_the_better_of_the_old_policy_and_a_fresh_one(offse
     np.testing.assert_allclose(after.policy.params["aim"], old["aim"] if kept else -3.0, atol=1e-6)
     resumed, _ = jax.jit(exp.search)(state, jnp.int32(1))  # not the first iteration: no second thoughts
     np.testing.assert_allclose(resumed.policy.params["aim"], old["aim"], atol=1e-6)
+
+
+def test_random_episodes_come_before_any_learning():
+    """With two random trials the first leaves model and policy as they were, and says so."""
+    exp = compose(tiny(**QUICK, explore__trials=2), cart(), regression(2, 1), noisy_linear_policy(cart()))
+    first = exp.init(jax.random.key(5))
+    last, info = unchecked(jax.jit(run(exp, 3, EPISODES)))(jax.random.key(5))
+    unknown = [True, False, False]
+    assert np.isnan(info.fit.loss).tolist() == np.isnan(info.search.objective).all(1).tolist() == unknown
+    assert info.search.skipped.tolist() == [0, 0, 0]
+    again = jax.jit(lambda s: exp.improve(exp.absorb(s, exp.collect(s)))[0])
+    kept = again(first)
+    assert same((kept.model, kept.policy), (first.model, first.policy))
+    learned = again(kept)
+    assert not same(learned.policy, first.policy)
+    close(again(learned), last)

@@ -130,7 +130,9 @@ def search_of(
     pieces: dict[str, Any] = dict(
         dynamics=dynamics, policy=policy, match=moments.match if search.match else moments.keep, noise=noise
     )
-    ends: dict[str, Any] = dict(aggregate=discounted(search, aggregate), truncate=search.truncate)
+    # A particle's cost is 1 / K of the objective.
+    limit = None if search.limit is None else search.limit / search.particles
+    ends: dict[str, Any] = dict(aggregate=discounted(search, aggregate), truncate=search.truncate, limit=limit)
     costs = costs_of(search, task)
 
     def value(params: Params, belief: Params, given: Scenarios, *width: Array) -> Array:

@@ -277,6 +277,7 @@ class Search:
     widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
+    limit: float | None = setting(None, "largest gradient of a particle's cost by its state, at each step; null: none")
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
@@ -301,6 +302,8 @@ class Search:
         _within("search.widen", self.widen, 1)
         if self.truncate is not None:
             _within("search.truncate", self.truncate, 1)
+        if self.limit is not None:
+            _within("search.limit", self.limit, 0, open_low=True)
         for name in ("policy_noise", "state_noise", "cost_noise"):
             _within(f"search.{name}", getattr(self, name), 0)
 

@@ -27,12 +27,14 @@ def rollout(
     match: Callable[[Array, Array], Array],
     noise: NoiseUse = NoiseUse(),
     truncate: int | None = None,
+    limit: float | None = None,
 ) -> Rollout:
     """Roll K particles out for H steps (Alg. 3 lines 6 to 14).
 
     Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match` is
     `moments.match` or `moments.keep`. No gradient flows through the predicted noise, nor, with `truncate`, through
-    the states 0, truncate, 2 truncate, ...: truncated back-propagation through time.
+    the states 0, truncate, 2 truncate, ...: truncated back-propagation through time. With a `limit`, the gradient
+    that goes back through a particle's state is never longer than that.
     """
     act = jax.vmap(policy.apply, (None, 0, 0))
     predict = jax.vmap(dynamics.apply, (None, 0, 0, 0))
@@ -42,6 +44,8 @@ def rollout(
         t, sensor, redraw = draws
         if truncate is not None:
             x = jnp.where(t % truncate == 0, jax.lax.stop_gradient(x), x)
+        if limit is not None:
+            x = limited(x, limit)
         u = act(policy_params, scenarios.policy, x + noise.policy * blur)
         change = predict(belief, scenarios.dynamics, x, u)
         std = jax.lax.stop_gradient(change.std)
@@ -54,3 +58,21 @@ def rollout(
     draws = (times, scenarios.sensor, scenarios.match)
     _, (x, u, std, seen) = jax.lax.scan(step, (start, jnp.zeros_like(start)), draws)
     return Rollout(jnp.concatenate([start[None], x]), u, std, seen)
+
+
+def limited(x: Array, limit: float) -> Array:
+    """x [K, D] itself, whose gradient is shortened, row by row, to a norm of `limit`; one that is not finite is none.
+
+    On a plant that is chaotic the gradient of one particle can be 1e9 times that of the others: clipped after the sum
+    over particles, only its direction would be left.
+    """
+
+    def shortened(_: None, gradient: Array) -> tuple[Array]:
+        square = jnp.sum(gradient**2, -1, keepdims=True)
+        known = jnp.isfinite(square)
+        factor = limit * jax.lax.rsqrt(jnp.maximum(jnp.where(known, square, 0.0), limit**2))
+        return (jnp.where(known, gradient * factor, 0.0),)
+
+    same = jax.custom_vjp(lambda x: x)
+    same.defvjp(lambda x: (x, None), shortened)
+    return same(x)  # type: ignore[return-value]

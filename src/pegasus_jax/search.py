@@ -61,6 +61,7 @@ def objective(
     aggregate: Callable[[Array], Array] = costs.mean,
     noise: NoiseUse = NoiseUse(),
     truncate: int | None = None,
+    limit: float | None = None,
 ) -> Array:
     """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
     imagined = rollout(
@@ -72,6 +73,7 @@ def objective(
         match=match,
         noise=noise,
         truncate=truncate,
+        limit=limit,
     )
     return aggregate(cost(imagined.seen))
 

@@ -18,7 +18,7 @@ from pegasus_jax.record import write_whole
 from pegasus_jax.tasks import GYM
 from pegasus_jax.train import saturated, succeeded
 from pegasus_jax.trial import TrialInfo, trial
-from pegasus_jax.types import Array, Experiment, RunState, Task, Trajectory
+from pegasus_jax.types import Array, Experiment, RunState, Task
 
 SOLVED = 0.9  # of a trial's evaluation episodes succeed
 
@@ -41,14 +41,14 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
     program = lowered.compile()
     # A program of its own, so that looking changes no number.
     look = jax.jit(jax.vmap(partial(diagnosed, experiment)))
-    look = look.lower(states, states, lowered.out_info[1].trajectory).compile()
+    look = look.lower(states, states, lowered.out_info[1]).compile()
     compiled = time.monotonic()
     infos, looks, result = [], [], {}
     for count in range(1, config.trials + 1):
         before = states
         states, info = jax.block_until_ready(program(states))
         infos.append(jax.tree.map(np.asarray, info))
-        looks.append(jax.tree.map(np.asarray, look(before, states, info.trajectory)))
+        looks.append(jax.tree.map(np.asarray, look(before, states, info)))
         result = curves(config, seeds, stacked(infos), experiment.task) | diagnostics(*stacked(looks))
         result |= {"compile_seconds": round(compiled - began, 1), "run_seconds": round(time.monotonic() - compiled, 1)}
         if path is not None:
@@ -59,9 +59,13 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
     return result
 
 
-def diagnosed(experiment: Experiment, before: RunState, after: RunState, episode: Trajectory) -> tuple[Array, Array]:
-    """Of one trial: calibration of the model on the episode it had not seen, and the objective on fresh scenarios."""
-    return experiment.calibrate(before, episode), jnp.mean(experiment.imagine(after)[1])
+def diagnosed(experiment: Experiment, before: RunState, after: RunState, info: TrialInfo) -> tuple[Array, Array]:
+    """Of one trial: calibration of the model on the episode it had not seen, and the objective on fresh scenarios.
+
+    NaN where there is none: before the first fit, and of a trial without a search.
+    """
+    fresh = jnp.mean(experiment.imagine(after)[1])
+    return experiment.calibrate(before, info.trajectory), jnp.where(jnp.isnan(info.fit.loss), jnp.nan, fresh)
 
 
 def stacked(trials: list[Any]) -> Any:

@@ -26,6 +26,16 @@ from pegasus_jax.types import Experiment, Key, Params, RunState, Task, Trajector
 
 EPISODES = 20  # evaluation episodes a trial; never data
 
+# What `improved` says of a trial that has not improved anything.
+UNKNOWN: dict[str, Any] = {
+    "fit_loss": None,
+    "objective_first": None,
+    "objective_last": None,
+    "objective_fresh": None,
+    "gradient_norm": None,
+    "skipped_updates": 0,
+}
+
 
 def train(config: Config, run: Path, *, resume: bool = False, command: str = "") -> RunState:
     """Run (or go on with) `config` in the folder `run`, and return the state after its last trial.
@@ -99,9 +109,37 @@ def one_trial(
     display.phase(trial, "collect")
     episodes = collected(states, trial, config, runs, task, program)
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes)
-    # Before this episode teaches the model. The first has none to judge, and should not wait for the compiler.
-    calibration = fetched(program("calibrate", states, stacked)) if trial > 1 else np.full(len(runs), np.nan)
-    states = program("absorb", states, stacked)
+    # Before this episode teaches the model, and after another has. No first trial should wait for the compiler.
+    judged = trial > max(1, config.explore.trials)
+    calibration = fetched(program("calibrate", states, stacked)) if judged else np.full(len(runs), np.nan)
+    states, found = program("absorb", states, stacked), [UNKNOWN] * len(runs)
+    if trial >= config.explore.trials:  # before that, the next episode is random, and needs no policy
+        states, found = improved(states, trial, runs, stacked, program, display)
+    display.phase(trial, "evaluate", 0.9)
+    keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(fetched(states.key))
+    evaluation = evaluate(keys, states.policy.params, task, partial(program, "episode", purpose="evaluate"), EPISODES)
+    seconds = program.seconds()
+    rows = [
+        {
+            "trial": trial,
+            "plant_seconds": round(trial * task.horizon * task.dt, 6),
+            "random": trial <= config.explore.trials,
+            "episode_cost": float(np.mean(episode.cost)),
+            **evaluation[index],
+            **found[index],
+            "saturated": float(saturated(episode.u, task)),
+            "calibration": known(calibration[index]),
+            "seconds": seconds,
+        }
+        for index, episode in enumerate(episodes)
+    ]
+    return states, rows
+
+
+def improved(
+    states: RunState, trial: int, runs: Sequence[Path], stacked: Trajectory, program: Program, display: Display
+) -> tuple[RunState, list[dict[str, Any]]]:
+    """Fit, search, and imagine what comes; how it went, of each run."""
     display.phase(trial, "fit", 0.02)
     states, fitted = fetched_info(program("fit", states))
     found = []
@@ -114,33 +152,20 @@ def one_trial(
         found.append(jax.tree.map(np.asarray, searched))
     objective, norm = (np.concatenate([getattr(f, name) for f in found], 1) for name in ("objective", "gradient_norm"))
     skipped = fitted.skipped + sum(f.skipped for f in found)
-    display.phase(trial, "evaluate", 0.9)
     imagined, imagined_cost = fetched(program("imagine", states))
     for index, run in enumerate(runs if leads() else ()):
         record.save_imagined(run, trial, part(imagined, index), imagined_cost[index])
-    keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(fetched(states.key))
-    evaluation = evaluate(keys, states.policy.params, task, partial(program, "episode", purpose="evaluate"), EPISODES)
-    seconds = program.seconds()
-    rows = [
+    return states, [
         {
-            "trial": trial,
-            "plant_seconds": round(trial * task.horizon * task.dt, 6),
-            "random": trial <= config.explore.trials,
-            "episode_cost": float(np.mean(episode.cost)),
-            **evaluation[index],
             "fit_loss": float(fitted.loss[index]),
             "objective_first": float(objective[index, 0]),
             "objective_last": float(objective[index, -1]),
             "objective_fresh": float(jnp.mean(imagined_cost[index])),
             "gradient_norm": float(np.median(norm[index])),
             "skipped_updates": int(skipped[index]),
-            "saturated": float(saturated(episode.u, task)),
-            "calibration": known(calibration[index]),
-            "seconds": seconds,
         }
-        for index, episode in enumerate(episodes)
+        for index in range(len(runs))
     ]
-    return states, rows
 
 
 def collected(
@@ -245,13 +270,15 @@ def scalars(board: SummaryWriter, row: dict[str, Any]) -> None:
 
 def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
     """A trial in one line; over several seeds the means, and the median calibration."""
-    mean = {name: np.mean([row[name] for row in rows]) for name in ("mean_cost", "success_rate", "objective_last")}
+    mean = {name: np.mean([row[name] for row in rows]) for name in ("mean_cost", "success_rate")}
+    imagined = [row["objective_last"] for row in rows if row["objective_last"] is not None]
     first, skipped = rows[0], sum(row["skipped_updates"] for row in rows)
     solved = sum(row["success_rate"] >= 0.9 for row in rows)
     errors = [row["calibration"] for row in rows if row["calibration"] is not None]
     return (
         f"trial {first['trial']:>2}/{trials}  {first['plant_seconds']:6.1f} s of plant  cost {mean['mean_cost']:.3f}"
-        f"  success {mean['success_rate']:4.0%}  imagined {mean['objective_last']:.3f}"
+        f"  success {mean['success_rate']:4.0%}"
+        + (f"  imagined {np.mean(imagined):.3f}" if imagined else "")
         + (f"  calibration {np.median(errors):.1f}" if errors else "")
         + (f"  {solved} of {len(rows)} seeds solved" if len(rows) > 1 else "")
         + f"  ({sum(first['seconds'].values()):.0f} s, {first['seconds']['compile']:.0f} s of it compiling)"

@@ -134,6 +134,13 @@ def experiment(
         return jax.tree.map(partial(jnp.where, new <= kept), fresh, params)
 
     def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
+        """Fit and search (Alg. 1 lines 5 and 6), unless the next episode is random too: then nothing, and NaN of it."""
+        if explore_trials < 2:
+            return learn_and_improve(state)
+        info = jax.tree.map(_unknown, jax.eval_shape(learn_and_improve, state)[1])
+        return jax.lax.cond(state.trial < explore_trials, lambda old: (old, info), learn_and_improve, state)
+
+    def learn_and_improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
         state, fitted = learn(state)
         state, searched = improve_policy(state)
         return state, (fitted, searched)
@@ -144,14 +151,14 @@ def experiment(
         return imagine(trial_key(state.key, state.trial, IMAGINE), state.policy.params, belief)
 
     def calibrate(state: RunState, trajectory: Trajectory) -> Array:
-        """`calibration` of the model as it is, on the next episode before it is absorbed; NaN while there are no data.
+        """`calibration` of the model as it is, on the next episode before it is absorbed; NaN before the first fit.
 
         With a key of its own, so that asking changes nothing.
         """
         belief = dynamics.condition(state.model.params, state.data)
         key = trial_key(state.key, state.trial + 1, CALIBRATE)
         found = calibration(key, belief, trajectory, dynamics=dynamics, angles=task.angles)
-        return jnp.where(state.data.size > 0, found, jnp.nan)
+        return jnp.where(state.trial >= max(1, explore_trials), found, jnp.nan)
 
     return Experiment(
         task,
@@ -167,6 +174,11 @@ def experiment(
         look_ahead,
         calibrate,
     )
+
+
+def _unknown(like: jax.ShapeDtypeStruct) -> Array:
+    """What an info says of what was not done: NaN, or a count of 0."""
+    return jnp.full(like.shape, jnp.nan if jnp.issubdtype(like.dtype, jnp.floating) else 0, like.dtype)
 
 
 def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunState, TrialInfo]:
