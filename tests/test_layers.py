@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = {
     0: "types config variants",
     1: "angles mesh dropout whiten moments gaussian cost dataset scenarios rollout episode calibration",
-    2: "network noisy kernel fit lbfgs search pilco",
+    2: "network noisy kernel fit lbfgs search population pilco",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",

@@ -25,6 +25,7 @@ from pegasus_jax.policy.linear import linear
 from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.rbf import rbf
 from pegasus_jax.policy.squash import SQUASHES, to_limits
+from pegasus_jax.population import best_of
 from pegasus_jax.rollout import NoiseUse, rollout
 from pegasus_jax.search import keeping_best, narrowing, objective, particles, remembering
 from pegasus_jax.types import (
@@ -147,8 +148,11 @@ def search_of(
         period=Period(**vars(search.period)),
         width=narrowing(search.widen, search.steps / 2) if search.widen > 1 else None,
     )
-    imagine = partial(imagined, **pieces, blocks=blocks, cost=task.cost)
-    return keeping_best(searcher, search.steps) if search.best else searcher, imagine
+    if search.best:
+        searcher = keeping_best(searcher, search.steps)
+    if search.starts > 1:
+        searcher = best_of(searcher, policy.init, starts=search.starts, last=search.steps)
+    return searcher, partial(imagined, **pieces, blocks=blocks, cost=task.cost)
 
 
 def analytic_search_of(

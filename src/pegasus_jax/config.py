@@ -281,6 +281,7 @@ class Search:
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
+    starts: int = setting(1, "policies searched side by side, the old one and fresh ones, of which the best goes on")
     policy_noise: float = setting(1.0, "factor of the predicted noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
     cost_noise: float = setting(0.0, "factor of the predicted noise on what the cost sees")
@@ -304,6 +305,9 @@ class Search:
             _within("search.truncate", self.truncate, 1)
         if self.limit is not None:
             _within("search.limit", self.limit, 0, open_low=True)
+        _within("search.starts", self.starts, 1)
+        if self.starts > 1 and not self.reset:
+            raise SettingError(f"search.starts={self.starts} begins every search anew; it needs search.reset=true")
         for name in ("policy_noise", "state_noise", "cost_noise"):
             _within(f"search.{name}", getattr(self, name), 0)
 

@@ -1,0 +1,46 @@
+"""Several policies searched side by side in each trial: the old one and fresh ones. The best goes on."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.types import Array, Begin, Key, Learner, Params, Searcher
+
+FRESH = 2**31 - 1  # what a search's key is folded with for fresh policies; for its scenarios these numbers are small
+
+
+def best_of(searcher: Searcher, fresh: Callable[[Key], Params], *, starts: int, last: int) -> Searcher:
+    """The searcher that searches from `starts` policies under the same scenarios, all of them until the trial ends.
+
+    The first is the policy it is given, the others are `fresh` at iteration 0 of each trial; all begin with a new
+    optimiser, so `begin` is not asked. The learner's parameters are always those of the member with the lowest mean
+    objective over the last twentieth of a search of `last` iterations, or as many as there were. Its optimiser is all
+    members: a `Learner` [starts, ...].
+    """
+    window = max(1, last // 20)
+
+    def init(params: Params) -> Learner:
+        members = jax.tree.map(lambda leaf: jnp.stack([leaf] * starts), params)
+        return Learner(members, jax.vmap(searcher.init)(members))
+
+    def run(
+        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, begin: Begin | None = None
+    ) -> tuple[Learner, Any]:
+        del begin
+
+        def gathered() -> Learner:
+            others = jax.vmap(fresh)(jax.random.split(jax.random.fold_in(key, FRESH), starts - 1))
+            members = jax.tree.map(lambda own, rest: jnp.concatenate([own[None], rest]), learner.params, others)
+            return Learner(members, jax.vmap(searcher.init)(members))
+
+        members = jax.lax.cond(jnp.asarray(first) == 0, gathered, lambda: learner.optimizer)
+        search = lambda member: searcher.run(key, member, belief, first=first, steps=steps)  # noqa: E731
+        members, info = jax.vmap(search)(members)
+        values = jnp.mean(info.objective[:, -window:], 1)
+        best = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values))
+        params, info = jax.tree.map(lambda leaf: leaf[best], (members.params, info))
+        return Learner(params, members), info
+
+    return Searcher(init, run)

@@ -1,0 +1,107 @@
+"""Several searches side by side: each is the search it would be alone, and the best of them goes on."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from pegasus_jax import config
+from pegasus_jax.build import compose
+from pegasus_jax.config import SettingError
+from pegasus_jax.population import best_of
+from pegasus_jax.search import SearchInfo
+from pegasus_jax.types import Learner, Searcher
+from probes import cart, noisy_linear_policy, regression, same, tiny, unchecked
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+STARTS, STEPS = 4, 60
+
+
+def wells(params, belief):
+    """Two valleys, at -1 and 1; the belief says how much deeper that at 1 is. Beyond 3 nothing is known."""
+    return jnp.where(params > 3, jnp.nan, (params**2 - 1) ** 2 - belief * params)
+
+
+def descent():
+    """Plain gradient descent, as a searcher without scenarios."""
+    optimizer = optax.sgd(0.02, momentum=0.5)
+
+    def run(key, learner, belief, *, first, steps, begin=None):
+        def step(learner, _):
+            value, gradient = jax.value_and_grad(wells)(learner.params, belief)
+            updates, state = optimizer.update(gradient, learner.optimizer)
+            return Learner(learner.params + updates, state), (value, jnp.abs(gradient))
+
+        learner, (values, norms) = jax.lax.scan(step, learner, None, steps)
+        return learner, SearchInfo(values, norms, jnp.int32(0))
+
+    return Searcher(optimizer.init, run)
+
+
+def found(own, others, belief=0.1, key=0, starts=STARTS, calls=1):
+    """(learner, info) of a search of 60 iterations in so many calls."""
+    fresh = lambda key: jax.random.choice(key, jnp.asarray(others))  # noqa: E731
+    searcher = best_of(descent(), fresh, starts=starts, last=STEPS)
+    learner = Learner(jnp.float32(own), searcher.init(jnp.float32(own)))
+    run, info = jax.jit(partial(searcher.run, steps=STEPS // calls)), None
+    for call in range(calls):
+        learner, info = run(jax.random.key(key), learner, belief, first=call * (STEPS // calls))
+    return learner, info
+
+
+def test_a_policy_in_the_wrong_valley_gives_way_to_a_fresh_one():
+    learner, info = found(-1.2, [0.8])
+    np.testing.assert_allclose(learner.params, 1.0, atol=0.05)
+    np.testing.assert_allclose(info.objective[-1], wells(learner.params, 0.1), atol=1e-5)
+    np.testing.assert_allclose(learner.optimizer.params[0], -1.0, atol=0.05)  # it was searched from, too
+
+
+def test_a_policy_in_the_right_valley_stays_itself():
+    learner, _ = found(1.2, [-0.8])
+    alone, _ = descent().run(
+        None, Learner(jnp.float32(1.2), optax.sgd(0.02, momentum=0.5).init(0.0)), 0.1, first=0, steps=STEPS
+    )
+    np.testing.assert_allclose(learner.params, alone.params, rtol=1e-6)
+
+
+def test_what_is_not_a_number_is_never_the_best():
+    learner, info = found(-1.2, [4.0])
+    np.testing.assert_allclose(learner.params, -1.0, atol=0.05)
+    assert np.all(np.isfinite(info.objective))
+
+
+def test_two_calls_do_what_one_does():
+    (once, _), (twice, info) = found(-1.2, [0.5, 0.8]), found(-1.2, [0.5, 0.8], calls=2)
+    assert same(once, twice)
+    assert info.objective.shape == (STEPS // 2,)
+
+
+def test_every_search_has_fresh_policies_of_its_own():
+    others = np.linspace(-2, 2, 101)
+    members = [found(0.3, others, key=key)[0].optimizer.params for key in (0, 0, 1)]
+    assert np.array_equal(members[0], members[1])
+    assert members[0][0] == members[2][0]  # the policy itself
+    assert not np.any(members[0][1:] == members[2][1:])
+
+
+def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():
+    chosen = tiny(trials=2, fit__steps=5, search__steps=4, search__particles=5, search__starts=3)
+    exp = compose(chosen, cart(), regression(2, 1), noisy_linear_policy(cart()))
+    state = exp.init(jax.random.key(0))
+    after, (_, info) = unchecked(jax.jit(lambda s: exp.improve(exp.absorb(s, exp.collect(s)))))(state)
+    shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (state.policy, after.policy)]
+    assert shapes[0] == shapes[1]
+    assert info.objective.shape == (4,)
+    assert not same(after.policy.params, state.policy.params)
+    everyone = after.policy.optimizer.params
+    members = [jax.tree.map(lambda leaf: leaf[i], everyone) for i in range(3)]  # noqa: B023
+    assert any(same(after.policy.params, member) for member in members)
+
+
+def test_starts_begin_every_search_anew():
+    with pytest.raises(SettingError, match=r"search\.starts=4 begins every search anew; it needs search\.reset=true"):
+        config.Search(starts=4, reset=False)
