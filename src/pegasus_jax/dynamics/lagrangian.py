@@ -129,7 +129,7 @@ def lagrangian(
         return Prediction(change, head(belief.params["raw_std"]) * units.change)
 
     def loss(params: Params, key: Key, batch: Batch, units: Units) -> Array:
-        """Eq. 2 divided by N, but of Student's t, with fresh noise for every row; the constants have the weights' prior."""
+        """Eq. 2 / N, but of Student's t, with fresh noise for every row; the constants have the weights' prior."""
         masks = network.sample(key, params["noise"], batch.x.shape[0])
         predicted = jax.vmap(lambda masks, x, u: predict(Belief(params, units), masks, x, u))(masks, batch.x, batch.u)
         prior = weight_decay / 2 * sum(jnp.sum(params[name] ** 2) for name in ("control", "constant", "resistance"))
