@@ -1,6 +1,7 @@
 """Several searches side by side: each is the search it would be alone, and the best of them goes on."""
 
 from functools import partial
+from operator import itemgetter
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +19,7 @@ from probes import cart, noisy_linear_policy, regression, same, tiny, unchecked
 
 pytestmark = pytest.mark.usefixtures("quick_compile")
 
-STARTS, STEPS = 4, 60
+STARTS, STEPS, DEEPER = 4, 60, 0.1
 
 
 def wells(params, belief):
@@ -42,28 +43,28 @@ def descent():
     return Searcher(optimizer.init, run)
 
 
-def found(own, others, belief=0.1, key=0, starts=STARTS, calls=1):
+def found(own, others, key=0, calls=1):
     """(learner, info) of a search of 60 iterations in so many calls."""
     fresh = lambda key: jax.random.choice(key, jnp.asarray(others))  # noqa: E731
-    searcher = best_of(descent(), fresh, starts=starts, last=STEPS)
+    searcher = best_of(descent(), fresh, starts=STARTS, last=STEPS)
     learner = Learner(jnp.float32(own), searcher.init(jnp.float32(own)))
     run, info = jax.jit(partial(searcher.run, steps=STEPS // calls)), None
     for call in range(calls):
-        learner, info = run(jax.random.key(key), learner, belief, first=call * (STEPS // calls))
+        learner, info = run(jax.random.key(key), learner, DEEPER, first=call * (STEPS // calls))
     return learner, info
 
 
 def test_a_policy_in_the_wrong_valley_gives_way_to_a_fresh_one():
     learner, info = found(-1.2, [0.8])
     np.testing.assert_allclose(learner.params, 1.0, atol=0.05)
-    np.testing.assert_allclose(info.objective[-1], wells(learner.params, 0.1), atol=1e-5)
+    np.testing.assert_allclose(info.objective[-1], wells(learner.params, DEEPER), atol=1e-5)
     np.testing.assert_allclose(learner.optimizer.params[0], -1.0, atol=0.05)  # it was searched from, too
 
 
 def test_a_policy_in_the_right_valley_stays_itself():
     learner, _ = found(1.2, [-0.8])
     alone, _ = descent().run(
-        None, Learner(jnp.float32(1.2), optax.sgd(0.02, momentum=0.5).init(0.0)), 0.1, first=0, steps=STEPS
+        None, Learner(jnp.float32(1.2), optax.sgd(0.02, momentum=0.5).init(0.0)), DEEPER, first=0, steps=STEPS
     )
     np.testing.assert_allclose(learner.params, alone.params, rtol=1e-6)
 
@@ -98,7 +99,7 @@ def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():
     assert info.objective.shape == (4,)
     assert not same(after.policy.params, state.policy.params)
     everyone = after.policy.optimizer.params
-    members = [jax.tree.map(lambda leaf: leaf[i], everyone) for i in range(3)]  # noqa: B023
+    members = [jax.tree.map(itemgetter(i), everyone) for i in range(3)]
     assert any(same(after.policy.params, member) for member in members)
 
 
