@@ -95,9 +95,9 @@ def test_plain_torch_does_the_same_work(match, activation):
     from benchmarks.peers.compare import disagreement, problem_of
 
     given = workload({**TINY, "search.match": match, "model.activation": activation}, horizon=3)
-    objective, gradient = disagreement(given, problem_of(given), plain_torch.step)
-    assert objective < 1e-5
-    assert gradient < 1e-3
+    found = disagreement(given, problem_of(given), plain_torch.step)
+    assert found["objective"] < 1e-5
+    assert found["gradient"] < 1e-3
 
 
 @pytest.mark.skipif("PROB_MBRL" not in os.environ, reason="PROB_MBRL names no checkout of prob_mbrl")
@@ -113,3 +113,30 @@ def test_prob_mbrl_does_the_same_work(match):
     assert found["gradient"] < 1e-3
     for program in of_prob_mbrl.programs(package, given, layers_of, tensor, steps=2, fit_steps=2).values():
         program()
+
+
+@pytest.mark.skipif("MC_PILCO" not in os.environ, reason="MC_PILCO names no checkout of MC-PILCO")
+def test_mc_pilco_does_the_same_work():
+    from benchmarks.peers import of_mc_pilco
+
+    package = of_mc_pilco.load(Path(os.environ["MC_PILCO"]))
+    words = {"task": "cartpole", **of_mc_pilco.SETTINGS, "search.particles": "20", "policy.units": "7"}
+    given = of_mc_pilco.comparable(words, horizon=3)
+    with jax.enable_x64(True):
+        double = of_mc_pilco.in_double(given)
+        found = of_mc_pilco.disagreement(package, double)
+        program = of_mc_pilco.search(package, double, steps=2)
+    assert found["objective"] < 1e-12
+    assert found["gradient"] < 1e-9
+    assert found["std"] < 1e-6
+    program()
+
+
+@pytest.mark.parametrize("found", [{"objective": 2e-5}, {"objective": 0.0, "gradient": 2e-3}, {"objective": np.nan}])
+def test_a_peer_that_does_other_work_is_refused(found):
+    pytest.importorskip("torch", reason="the extra `peers` is not installed")
+    from benchmarks.peers.compare import agreed
+
+    assert agreed("peer", {"gradient": 1e-4}) == {"peer_gradient_difference": 1e-4}
+    with pytest.raises(RuntimeError, match=f"peer: the {list(found)[-1]} differs"):
+        agreed("peer", found)

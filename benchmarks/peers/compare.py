@@ -1,12 +1,14 @@
 """Our search step and plain PyTorch's, in turn in one process, once they agree on the objective and its gradient.
 
     taskset -c 0 python -m benchmarks.peers.compare [sizes=cart-pole,...] [repeats=5] [compile=true] [setting=value ...]
-        [prob_mbrl=CHECKOUT] [out=benchmarks/results/peers.json]
+        [prob_mbrl=CHECKOUT] [mc_pilco=CHECKOUT] [out=benchmarks/results/peers.json]
 
 Needs the extra `peers`. Pin it to as many CPUs as you ask `threads=` for: nothing else holds XLA to one. `compile=true`
 adds torch.compile of a time step, tuned by hand (a C++ compiler and a minute are needed). Sizes are in `workloads`.
 `prob_mbrl=` adds the authors' PyTorch code, its search step and its fit step, where you have a clone of
 github.com/mcgillmrl/prob_mbrl and `pip install tqdm joblib`: see `of_prob_mbrl`, also for what agrees and what differs.
+`mc_pilco=` adds MC-PILCO's search step, beside ours of `model=gp policy=rbf` in float32 and in float64, where you have
+a clone of github.com/merlresearch/MC-PILCO: see `of_mc_pilco`. The sizes must have one control.
 """
 
 import json
@@ -23,7 +25,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks.peers import of_prob_mbrl, plain_torch
+from benchmarks.peers import of_mc_pilco, of_prob_mbrl, plain_torch
 from benchmarks.timing import compiled, in_turn, own_products, summary
 from benchmarks.workloads import SIZES, Workload, goal, workload
 from pegasus_jax import settings
@@ -31,6 +33,7 @@ from pegasus_jax.record import about
 
 RESULTS = Path(__file__).parents[1] / "results"
 STEPS, FIT_STEPS = 10, 100  # in one timed run
+LIMITS = {"objective": 1e-5, "gradient": 1e-3, "std": 1e-3}  # of what programs that do the same disagree by
 
 
 def tensor(array: Any) -> Tensor:
@@ -66,7 +69,7 @@ def problem_of(work: Workload) -> plain_torch.Problem:
     )
 
 
-def disagreement(work: Workload, problem: plain_torch.Problem, one: Callable) -> tuple[float, float]:
+def disagreement(work: Workload, problem: plain_torch.Problem, one: Callable) -> dict[str, float]:
     """Difference of the two objectives, and of their gradients relative to the gradient's norm."""
     given = work.scenarios
     draws = plain_torch.Draws(
@@ -80,7 +83,15 @@ def disagreement(work: Workload, problem: plain_torch.Problem, one: Callable) ->
     pairs = zip(layers_of(gradient["network"]), policy, strict=True)
     flat = [(a.numpy(), b.grad.numpy()) for pair in pairs for a, b in zip(*pair, strict=True)]
     difference, size = (np.sqrt(sum(np.sum(f(a, b) ** 2) for a, b in flat)) for f in (np.subtract, lambda a, _: a))
-    return abs(float(ours) - theirs.item()), float(difference / size)
+    return {"objective": abs(float(ours) - theirs.item()), "gradient": float(difference / size)}
+
+
+def agreed(name: str, found: dict[str, float]) -> dict[str, float]:
+    """The differences as a row has them. RuntimeError if one is too much."""
+    for key, value in found.items():
+        if not value <= LIMITS[key]:  # nor may it be NaN
+            raise RuntimeError(f"{name}: the {key} differs by {value:.1e}; at most {LIMITS[key]:.0e} is rounding")
+    return {f"{name}_{key}_difference": value for key, value in found.items()}
 
 
 def compare(work: Workload, repeats: int, tuned: bool, prob_mbrl: Any = None) -> dict[str, Any]:
@@ -91,9 +102,7 @@ def compare(work: Workload, repeats: int, tuned: bool, prob_mbrl: Any = None) ->
         versions["compiled"] = torch.compile(partial(plain_torch.step, activate=plain_torch.tuned_relu))
     row: dict[str, Any] = {}
     for name, one in versions.items():
-        row[f"{name}_objective_difference"], row[f"{name}_gradient_difference"] = disagreement(work, problem, one)
-        if row[f"{name}_objective_difference"] > 1e-5:
-            raise RuntimeError(f"{name}: the objectives differ by {row[f'{name}_objective_difference']:.1e}")
+        row |= agreed(name, disagreement(work, problem, one))
     ours, _ = compiled(partial(work.experiment.search, steps=STEPS), work.state, jnp.int32(1))
     programs = {"ours": ours}
     policy = layers_of(work.state.policy.params["network"])
@@ -101,10 +110,7 @@ def compare(work: Workload, repeats: int, tuned: bool, prob_mbrl: Any = None) ->
         search = plain_torch.searcher(problem, policy, particles, work.config.search.learning_rate, one)
         programs[name] = lambda search=search: [search() for _ in range(STEPS)]
     if prob_mbrl is not None:
-        found = of_prob_mbrl.disagreement(prob_mbrl, work, layers_of, tensor)
-        row |= {f"prob_mbrl_{name}_difference": value for name, value in found.items()}
-        if found["objective"] > 1e-5:
-            raise RuntimeError(f"prob_mbrl: the objectives differ by {found['objective']:.1e}")
+        row |= agreed("prob_mbrl", of_prob_mbrl.disagreement(prob_mbrl, work, layers_of, tensor))
         theirs = of_prob_mbrl.programs(prob_mbrl, work, layers_of, tensor, STEPS, FIT_STEPS)
         fit, _ = compiled(partial(work.experiment.fit, steps=FIT_STEPS), work.state)
         fits = in_turn({"ours": fit, "prob_mbrl": theirs["fit"]}, repeats)
@@ -118,10 +124,26 @@ def compare(work: Workload, repeats: int, tuned: bool, prob_mbrl: Any = None) ->
     return row
 
 
+def beside_mc_pilco(package: Any, work: Workload, repeats: int) -> dict[str, Any]:
+    """The same of MC-PILCO and of ours with a Gaussian process, in float32 and in float64."""
+    search = partial(work.experiment.search, steps=STEPS)
+    programs = {"ours_gp": compiled(search, work.state, jnp.int32(1))[0]}
+    with jax.enable_x64(True):
+        double = of_mc_pilco.in_double(work)
+        row: dict[str, Any] = agreed("mc_pilco", of_mc_pilco.disagreement(package, double))
+        programs["ours_gp_double"], _ = compiled(search, double.state, jnp.int32(1))
+        programs["mc_pilco"] = of_mc_pilco.search(package, double, STEPS)
+    row |= {f"{name}_ms": summary(runs, STEPS)["min_ms"] for name, runs in in_turn(programs, repeats).items()}
+    row["ours_of_mc_pilco"] = row["ours_gp_ms"] / row["mc_pilco_ms"]
+    row["ours_double_of_mc_pilco"] = row["ours_gp_double_ms"] / row["mc_pilco_ms"]
+    return row
+
+
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, dotted = settings.split(words, ("sizes", "repeats", "compile", "threads", "prob_mbrl", "out"))
+    options, dotted = settings.split(words, ("sizes", "repeats", "compile", "threads", "prob_mbrl", "mc_pilco", "out"))
     prob_mbrl = of_prob_mbrl.load(Path(options["prob_mbrl"])) if "prob_mbrl" in options else None
+    mc_pilco = of_mc_pilco.load(Path(options["mc_pilco"])) if "mc_pilco" in options else None
     torch.set_num_threads(int(options.get("threads", "1")))
     names = options["sizes"].split(",") if "sizes" in options else list(SIZES)
     rows = {}
@@ -129,6 +151,9 @@ def main(words: list[str]) -> None:
         work = workload({**SIZES[name], **dotted})
         tuned, repeats = options.get("compile") == "true", int(options.get("repeats", "5"))
         rows[name] = compare(work, repeats, tuned, prob_mbrl)
+        if mc_pilco is not None:
+            work = of_mc_pilco.comparable({**SIZES[name], **of_mc_pilco.SETTINGS, **dotted})
+            rows[name] |= beside_mc_pilco(mc_pilco, work, repeats)
         print(name, json.dumps({key: float(f"{value:.3g}") for key, value in rows[name].items()}), flush=True)
     command = shlex.join(["python", "-m", "benchmarks.peers.compare", *words])
     result = {"rows": rows, "torch": torch.__version__, "about": about(command)}
