@@ -22,10 +22,15 @@ from pegasus_jax.search import objective
 from pegasus_jax.types import Array, Experiment, Params, Period, RunState, Scenarios, Task, Trajectory
 
 SIZES = {
-    "cart-pole": {"task": "cartpole", "policy": "dropout_mlp", "search.particles": "100"},
+    "cart-pole": {"task": "cartpole", "model": "log_normal", "policy": "dropout_mlp", "search.particles": "100"},
     "double cart-pole": {"task": "double_cartpole", "search.particles": "100"},
     "swimmer, 6 legs": {"task": "swimmer_depth_change", "legs": "6", "search.particles": "100"},
-    "cart-pole, K=1000": {"task": "cartpole", "policy": "dropout_mlp", "search.particles": "1000"},
+    "cart-pole, K=1000": {
+        "task": "cartpole",
+        "model": "log_normal",
+        "policy": "dropout_mlp",
+        "search.particles": "1000",
+    },
 }
 EPISODES = 4  # of data
 

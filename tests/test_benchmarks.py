@@ -14,6 +14,7 @@ from benchmarks.workloads import SIZES, flop, products, workload
 
 TINY = {
     "task": "cartpole",
+    "model": "log_normal",
     "policy": "dropout_mlp",
     "search.particles": "20",
     "model.hidden": "[8,8]",

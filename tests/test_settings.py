@@ -10,15 +10,16 @@ from hypothesis import strategies as st
 
 from pegasus_jax import config, settings
 from pegasus_jax.build import compose
-from pegasus_jax.config import BNN, MLP, RBF, Analytic, Config, Explore, Fit, Period, Search, SettingError
-from pegasus_jax.tasks import TASKS
+from pegasus_jax.config import BNN, MLP, RBF, Analytic, Config, Explore, Fit, Lagrangian, Period, Search, SettingError
+from pegasus_jax.tasks import TASKS, defaults
 from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 from probes import cart
 
 
 def parse(*words):
+    """The config of these words, with the general model where they name none."""
     _, rest = settings.split(words, ("out", "resume"))
-    return settings.parse(rest, options=("out", "resume"))
+    return settings.parse({"model": "log_normal", **rest}, options=("out", "resume"))
 
 
 def value(chosen, key):
@@ -89,6 +90,15 @@ def test_no_word_gives_the_defaults():
     assert parse() == parse("task=cartpole", "algorithm=pegasus") == Config()
 
 
+def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorithms():
+    own = settings.parse({})
+    assert own.model == Lagrangian(substeps=1)
+    assert own == settings.parse({"task": "cartpole", "model": "lagrangian", "algorithm": "pegasus"})
+    assert settings.parse({"task": "cartpole", "model": "log_normal"}).model == BNN()
+    for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}, {"task": "double_cartpole"}):
+        assert settings.parse(words).model == settings.parse({"model": "log_normal", **words}).model
+
+
 def test_every_setting_has_a_spelling():
     """Its own default, written as the help text writes it, changes nothing; and the help names each."""
     text = "\n".join(settings.help_lines(Config()))
@@ -107,8 +117,10 @@ VARIANTS = [
 @pytest.mark.parametrize(("word", "variant"), VARIANTS)
 def test_a_variant_is_what_it_changes(word, variant):
     sections = {name: change for name, change in variant.items() if "." not in name}
-    settled = {name: change for name, change in variant.items() if "." in name}
-    assert parse(word) == settings.override(dataclasses.replace(Config(), **sections), settled)
+    chosen = dataclasses.replace(Config(), **sections)
+    settled = {name: change for name, change in (defaults("cartpole") | variant).items() if "." in name}
+    there = {name: change for name, change in settled.items() if name in settings.leaves(chosen)}
+    assert parse(word) == settings.override(chosen, there)
 
 
 def test_the_task_changes_only_what_the_chosen_variant_has():

@@ -102,7 +102,16 @@ def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
     """The configured way of fitting a model."""
     if isinstance(config, settings.LBFGS):
         return full_data(dynamics, starts=config.starts)
-    return minibatches(dynamics, optax.adam(config.learning_rate), batch=config.batch, reset=config.reset)
+    rate = falling(config.learning_rate, config.decay, config.steps)
+    return minibatches(dynamics, optax.adam(rate), batch=config.batch, reset=config.reset)
+
+
+def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
+    """A step size that falls from `rate` to `decay` of it over `steps` updates, as half a cosine, and begins again."""
+    if decay == 1:
+        return rate
+    fall = optax.cosine_decay_schedule(rate, steps, alpha=decay)
+    return lambda count: fall(count % steps)
 
 
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]  # (key, policy parameters, belief) -> cost [H, K] too
@@ -140,7 +149,7 @@ def search_of(
         return objective(params, belief, given, **pieces, **ends, cost=costs(*width))
 
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
-    optimizer = optax.chain(clip, optax.adam(search.learning_rate))
+    optimizer = optax.chain(clip, optax.adam(falling(search.learning_rate, search.decay, search.steps)))
     searcher = particles(
         value,
         remembering(optimizer) if search.best else optimizer,

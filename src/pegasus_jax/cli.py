@@ -16,7 +16,8 @@ pegasus-train task=NAME [setting=value ...]     learn a controller
 pegasus-train resume=RUN [trials=N]             go on with a run, also one that was killed
 
   task=cartpole         what to learn: {tasks}
-  model=log_normal      dynamics model: {models}
+  model=log_normal      dynamics model: {models};
+                        with task=cartpole it is lagrangian unless you say otherwise
   policy=mlp            controller: {policies}
   algorithm=pegasus     how to search: {algorithms}
   out=runs/...          the run's folder (default: runs/TASK-seedN)

@@ -222,6 +222,7 @@ class Fit:
     steps: int = setting(2000, "updates a trial")
     batch: int = setting(100, "rows an update")
     learning_rate: float = setting(3e-4, "Adam's step size")
+    decay: float = setting(1.0, "step size at the end of a fit, as a fraction of that at its start")
     reset: bool = setting(False, "forget Adam's moments at each trial")
 
     def __post_init__(self) -> None:
@@ -229,6 +230,7 @@ class Fit:
         _within("fit.steps", self.steps, 1)
         _within("fit.batch", self.batch, 1)
         _within("fit.learning_rate", self.learning_rate, 0, open_low=True)
+        _within("fit.decay", self.decay, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -268,6 +270,7 @@ class Search:
     steps: int = setting(1000, "iterations a trial")
     particles: int = setting(100, "K, imagined rollouts an iteration")
     learning_rate: float = setting(1e-3, "Adam's step size")
+    decay: float = setting(1.0, "step size at the end of a search, as a fraction of that at its start")
     clip: float | None = setting(1.0, "largest global norm of the gradient; null: no clipping")
     match: bool = setting(True, "moment matching")
     balanced: bool = setting(False, "make the drawn noise exactly zero mean, unit covariance over the particles")
@@ -277,7 +280,9 @@ class Search:
     widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
-    limit: float | None = setting(None, "largest gradient of a particle's cost by its state, at each step; null: none")
+    limit: float | None = setting(
+        None, "at each step, drop a particle's gradient by its state that is larger; null: none"
+    )
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
@@ -292,6 +297,7 @@ class Search:
         _within("search.steps", self.steps, 1)
         _within("search.particles", self.particles, 2)
         _within("search.learning_rate", self.learning_rate, 0, open_low=True)
+        _within("search.decay", self.decay, 0, 1)
         if self.clip is not None:
             _within("search.clip", self.clip, 0, open_low=True)
         _choice("search.aggregate", self.aggregate, AGGREGATES)

@@ -33,8 +33,8 @@ def rollout(
 
     Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match` is
     `moments.match` or `moments.keep`. No gradient flows through the predicted noise, nor, with `truncate`, through
-    the states 0, truncate, 2 truncate, ...: truncated back-propagation through time. With a `limit`, the gradient
-    that goes back through a particle's state is never longer than that.
+    the states 0, truncate, 2 truncate, ...: truncated back-propagation through time. With a `limit`, none goes
+    back through a particle's state that is longer than that.
     """
     act = jax.vmap(policy.apply, (None, 0, 0))
     predict = jax.vmap(dynamics.apply, (None, 0, 0, 0))
@@ -61,18 +61,17 @@ def rollout(
 
 
 def limited(x: Array, limit: float) -> Array:
-    """x [K, D] itself, whose gradient is shortened, row by row, to a norm of `limit`; one that is not finite is none.
+    """x [K, D] itself, whose gradient is dropped in the rows where it is longer than `limit`, or not finite.
 
-    On a plant that is chaotic the gradient of one particle can be 1e9 times that of the others: clipped after the sum
-    over particles, only its direction would be left.
+    On a plant that is chaotic the gradient of one particle can be 1e9 times that of the others: summed up, it would
+    drown them, and shortened, its direction would still be one of chance. Without it a particle answers for the
+    steps up to where chaos sets in, and no further.
     """
 
-    def shortened(_: None, gradient: Array) -> tuple[Array]:
+    def short(_: None, gradient: Array) -> tuple[Array]:
         square = jnp.sum(gradient**2, -1, keepdims=True)
-        known = jnp.isfinite(square)
-        factor = limit * jax.lax.rsqrt(jnp.maximum(jnp.where(known, square, 0.0), limit**2))
-        return (jnp.where(known, gradient * factor, 0.0),)
+        return (jnp.where(square <= limit**2, gradient, 0.0),)  # NaN is not
 
     same = jax.custom_vjp(lambda x: x)
-    same.defvjp(lambda x: (x, None), shortened)
+    same.defvjp(lambda x: (x, None), short)
     return same(x)  # type: ignore[return-value]

@@ -37,13 +37,16 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     for name, value in chosen.items():
         if value not in VARIANTS[name]:
             raise SettingError(f"{name}={value} is unknown; {nearest(value, VARIANTS[name])}")
+    task, algorithm = chosen.get("task", Config.task), chosen.get("algorithm", "pegasus")
+    # A task's best model goes with the best algorithm; the others are of the paper, and so is their model.
+    best = tasks.BEST_MODELS.get(task, "log_normal") if algorithm == "pegasus" else "log_normal"
     variants: dict[str, Any] = {
-        **MODELS[chosen.get("model", "log_normal")],
-        **ALGORITHMS[chosen.get("algorithm", "pegasus")],
+        **MODELS[chosen.get("model", best)],
+        **ALGORITHMS[algorithm],
         **(POLICIES[chosen["policy"]] if "policy" in chosen else {}),
     }
     sections = {name: value for name, value in variants.items() if dataclasses.is_dataclass(value)}
-    config = dataclasses.replace(Config(task=chosen.get("task", Config.task)), **sections)
+    config = dataclasses.replace(Config(task=task), **sections)
     config = override(config, values({key: words[key] for key in ("legs",) if key in words}))
     for changes in (tasks.defaults(config.task, config.legs), {k: v for k, v in variants.items() if k not in sections}):
         there = leaves(config)
