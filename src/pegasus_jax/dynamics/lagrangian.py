@@ -121,19 +121,23 @@ def lagrangian(
             q, v = state
             return jnp.stack([dt * v, units.speed * acceleration(belief, masks, q, v / units.speed, u)])
 
-        def stage(carry: tuple[Array, Array], weights: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
-            slope, total = carry
-            ahead, share = weights
-            slope = h * rate(now + ahead * slope)
-            return (slope, total + share * slope), None
+        def step(now: Array) -> Array:
+            """One step of the integration; its stages in a loop, because four copies would take longer to compile."""
+
+            def stage(carry: tuple[Array, Array], weights: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
+                slope, total = carry
+                ahead, share = weights
+                slope = h * rate(now + ahead * slope)
+                return (slope, total + share * slope), None
+
+            weights = jnp.asarray(AHEAD, now.dtype), jnp.asarray(SHARE, now.dtype)
+            (_, total), _ = jax.lax.scan(stage, (jnp.zeros_like(now),) * 2, weights)
+            now = now + total
+            return now.at[1].set(within(now[1], GREATEST_SPEED * units.speed))
 
         start = now = jnp.stack([x[coordinates], x[moving]])
-        stages = jnp.asarray(AHEAD, now.dtype), jnp.asarray(SHARE, now.dtype)
         for _ in range(substeps):
-            # A loop: four copies of the network and its derivatives would take longer to compile, and run no faster.
-            (_, total), _ = jax.lax.scan(stage, (jnp.zeros_like(now),) * 2, stages)
-            now = now + total
-            now = now.at[1].set(within(now[1], GREATEST_SPEED * units.speed))
+            now = step(now)
         change = jnp.zeros_like(x).at[coordinates].set(now[0] - start[0]).at[moving].set(now[1] - start[1])
         return Prediction(change, head(belief.params["raw_std"]) * units.change)
 
