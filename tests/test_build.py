@@ -7,9 +7,21 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.flatten_util import ravel_pytree
 
 from pegasus_jax import config, cost, dataset, moments, scenarios, settings, tasks, types
-from pegasus_jax.build import AGGREGATES, EXPLORATIONS, build, compose, dropout_of, search_of, start
+from pegasus_jax.build import (
+    AGGREGATES,
+    EXPLORATIONS,
+    build,
+    compose,
+    dropout_of,
+    dynamics_of,
+    falling,
+    fit_of,
+    search_of,
+    start,
+)
 from pegasus_jax.config import DROPOUTS, Config, Period, SettingError
 from pegasus_jax.dynamics.gp import gp
 from pegasus_jax.dynamics.ssgp import ssgp
@@ -19,7 +31,7 @@ from pegasus_jax.noisy import HEADS
 from pegasus_jax.policy.squash import SQUASHES
 from pegasus_jax.search import objective
 from pegasus_jax.trial import SEARCH, trial_key
-from pegasus_jax.types import Learner
+from pegasus_jax.types import Dataset, Learner
 from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
 from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, same, tiny
 
@@ -219,6 +231,34 @@ def test_a_limit_reaches_the_gradient_as_a_share_of_each_particle():
     assert plain.objective[0] == short.objective[0]
     assert short.gradient_norm[0] < 0.9 * plain.gradient_norm[0]
     np.testing.assert_allclose(same.gradient_norm[0], plain.gradient_norm[0], rtol=1e-5)
+
+
+def test_a_step_size_falls_as_half_a_cosine_and_begins_again():
+    rate = falling(2.0, 0.1, 100)
+    sizes = [float(rate(i)) for i in (0, 50, 99, 100, 150)]
+    np.testing.assert_allclose(sizes, [2.0, 1.1, 0.2, 2.0, 1.1], atol=1e-3)
+    assert falling(2.0, 1.0, 100) == 2.0
+
+
+def test_a_falling_step_size_reaches_the_search():
+    """Adam's first step is as long as the step size; of three that fall to nothing the others are 3/4 and 1/4 of it."""
+    moved = {}
+    for decay in (1.0, 0.0):
+        _, state, run = searcher(steps=3, decay=decay, learning_rate=1e-4, period=Period(0, 0, 0, 0, 0))
+        moved[decay] = np.abs(run(state)[0].policy.params - state.policy.params)
+    np.testing.assert_allclose(moved[0.0], moved[1.0] * 2 / 3, rtol=0.02)
+
+
+def test_a_falling_step_size_reaches_the_fit():
+    """One row, so that every gradient has the same sign."""
+    dynamics, moved = dynamics_of(config.BNN(hidden=(4,)), cart()), {}
+    row = jnp.ones((1, 2)), jnp.ones((1, 1)), jnp.ones((1, 2))
+    for decay in (1.0, 0.0):
+        fit = fit_of(config.Fit(steps=2, batch=1, decay=decay, learning_rate=1e-5), dynamics)
+        params = dynamics.init(jax.random.key(0))
+        learner, _ = fit.run(jax.random.key(1), Learner(params, fit.init(params)), Dataset(*row, jnp.int32(1)), 2)
+        moved[decay] = np.abs(ravel_pytree(learner.params)[0] - ravel_pytree(params)[0]).max()
+    np.testing.assert_allclose(moved[0.0], moved[1.0] * 3 / 4, rtol=0.05)
 
 
 def test_the_best_parameters_of_a_search_reach_the_policy():
