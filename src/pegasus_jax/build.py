@@ -111,7 +111,7 @@ def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
     if decay == 1:
         return rate
     fall = optax.cosine_decay_schedule(rate, steps, alpha=decay)
-    return lambda count: fall(count % steps)
+    return lambda count: fall(jnp.asarray(count) % steps)
 
 
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]  # (key, policy parameters, belief) -> cost [H, K] too

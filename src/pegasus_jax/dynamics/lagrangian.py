@@ -131,7 +131,8 @@ def lagrangian(
                 return (slope, total + share * slope), None
 
             weights = jnp.asarray(AHEAD, now.dtype), jnp.asarray(SHARE, now.dtype)
-            (_, total), _ = jax.lax.scan(stage, (jnp.zeros_like(now),) * 2, weights)
+            nothing = jnp.zeros_like(now)
+            (_, total), _ = jax.lax.scan(stage, (nothing, nothing), weights)
             now = now + total
             return now.at[1].set(within(now[1], GREATEST_SPEED * units.speed))
 
