@@ -280,9 +280,7 @@ class Search:
     widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
-    limit: float | None = setting(
-        None, "at each step, drop a particle's gradient by its state that is larger; null: none"
-    )
+    limit: float | None = setting(None, "a particle's gradient by its state that is longer is dropped; null: none is")
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")

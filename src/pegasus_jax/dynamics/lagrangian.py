@@ -22,7 +22,6 @@ LEAST_MASS, GREATEST_CHANGE, GREATEST_SPEED = 0.1, 20.0, 6.0
 # all others.
 DEGREES_OF_FREEDOM = 4.0
 
-
 # Runge and Kutta's four stages: how far ahead of the step's start each looks, by the slope before, and its share.
 AHEAD, SHARE = np.array([0, 1 / 2, 1 / 2, 1]), np.array([1, 2, 2, 1]) / 6
 
