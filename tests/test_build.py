@@ -17,7 +17,6 @@ from pegasus_jax.build import (
     compose,
     dropout_of,
     dynamics_of,
-    falling,
     fit_of,
     search_of,
     start,
@@ -25,6 +24,7 @@ from pegasus_jax.build import (
 from pegasus_jax.config import DROPOUTS, Config, Period, SettingError
 from pegasus_jax.dynamics.gp import gp
 from pegasus_jax.dynamics.ssgp import ssgp
+from pegasus_jax.fit import falling
 from pegasus_jax.gaussian import affine
 from pegasus_jax.network import INITIALISERS
 from pegasus_jax.noisy import HEADS
@@ -210,6 +210,37 @@ def test_a_search_starts_with_the_wider_cost_and_ends_with_the_tasks(of):
     values = [run(state)[1].objective for _, state, run in (narrowed, plain)]
     np.testing.assert_allclose(values[0][2:], values[1][2:], rtol=1e-5)
     assert np.all(values[0][:2] < 0.9 * values[1][:2])
+
+
+HELD = dict(steps=4, period=Period(0, 0, 0, 0, 0))  # the same scenarios for every iteration
+ALONE = dict(match=False, restart=False, **HELD)
+
+
+def test_a_search_that_lost_its_way_refines_the_policy_it_was_given():
+    """With steps of 10 the matched half is of no use. What refines has no matching, and each particle's own cost."""
+    _, state, run = searcher(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
+    (after, info), (_, _, alone) = run(state), searcher(learning_rate=1e-30, **ALONE)
+    np.testing.assert_allclose(info.objective[2], alone(state)[1].objective[0], rtol=1e-5)
+    assert np.any(after.policy.params != state.policy.params)
+
+
+def test_a_search_that_found_a_better_policy_refines_that():
+    better = dict(cost="matched", widen=1.0, learning_rate=0.02)
+    _, state, run = searcher(gain=-0.1, refine=0.5, **better, **HELD)
+    _, info = run(state)
+    exp, _, _ = searcher(gain=-0.1, **better, **HELD)
+    found, _ = eagerly(partial(exp.search, steps=2))(state)
+    _, _, alone = searcher(learning_rate=1e-30, **ALONE)
+    np.testing.assert_allclose(info.objective[2], alone(found)[1].objective[0], rtol=1e-5)
+    assert info.objective[2] < alone(state)[1].objective[0]
+
+
+def test_a_refining_search_in_parts_is_the_whole():
+    exp, state, run = searcher(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
+    part, parts = eagerly(partial(exp.search, steps=1)), state
+    for first in range(4):
+        parts, _ = part(parts, first)
+    np.testing.assert_allclose(parts.policy.params, run(state)[0].policy.params, rtol=1e-6)
 
 
 def test_a_cost_without_a_width_cannot_be_widened():

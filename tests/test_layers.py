@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
     0: "types config variants",
-    1: "angles mesh dropout whiten moments gaussian cost dataset scenarios rollout episode calibration",
+    1: "angles mesh dropout whiten moments gaussian cost course dataset scenarios rollout episode calibration",
     2: "network noisy kernel fit lbfgs search population pilco",
     3: "dynamics. policy. trial",
     4: "tasks",

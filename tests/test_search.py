@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from pegasus_jax import cost, moments, scenarios
+from pegasus_jax.course import Course, narrowing, pace
 from pegasus_jax.fit import guarded
 from pegasus_jax.rollout import NoiseUse
-from pegasus_jax.search import keeping_best, narrowing, objective, optimise, remembering
+from pegasus_jax.search import keeping_best, objective, optimise, remembering
 from pegasus_jax.types import Learner, Period, Scenarios, Searcher
 from probes import (
     PENDULUM,
@@ -239,11 +240,19 @@ def test_the_width_narrows_geometrically_and_stays():
     np.testing.assert_allclose(jax.vmap(narrowing(4.0, 10))(jnp.arange(0, 25, 5)), [4, 2, 1, 1, 1], rtol=1e-6)
 
 
+def test_the_pace_falls_and_begins_again_where_a_search_refines():
+    factor = pace(100, 0.2, 60)
+    np.testing.assert_allclose([factor(i) for i in (0, 30, 59.99)], [1, 0.6, 0.2], atol=1e-3)
+    np.testing.assert_allclose([factor(i) for i in (60, 80, 99.99)], [1, 0.515, 0.03], atol=1e-3)
+    np.testing.assert_allclose([pace(100, 0.2)(i) for i in (0, 50, 99.99)], [1, 0.6, 0.2], atol=1e-3)
+    assert pace(100, 1.0) is None
+
+
 def test_each_iteration_has_its_width_wherever_the_search_is_cut():
     optimizer = guarded(remembering(optax.adam(0.1)))
     pieces = dict(draw=follow, redraw=lambda key, step, held, belief: follow(key, step, belief), optimizer=optimizer)
-    widths = dict(width=narrowing(4.0, 3), objective=lambda params, *rest: distance(params, *rest[:2]) / rest[2])
-    run = partial(optimise, **pieces, **widths)
+    value = lambda *given: distance(*given[:3]) / given[3]  # noqa: E731
+    run = partial(optimise, **pieces, course=Course(stage=narrowing(4.0, 3), settled=3), objective=value)
     whole, info = run(jax.random.key(7), begin(optimizer), 1.0, steps=6)
     half, _ = run(jax.random.key(7), begin(optimizer), 1.0, steps=2)
     rest, last = run(jax.random.key(7), half, 1.0, steps=4, first=2)
@@ -329,9 +338,7 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
 def seeking(optimizer, steps, value=jnp.nan, bad=(), last=12):
     """A keeping searcher around `pursue`."""
     init, run = optimizer.init, pursue(optimizer, steps, bad=bad, value=value)
-    searcher = Searcher(
-        init, lambda key, learner, belief, *, first, steps, begin: run(key, learner, belief, first=first)
-    )
+    searcher = Searcher(init, lambda key, learner, belief, *, first, steps: run(key, learner, belief, first=first))
     return keeping_best(searcher, last)
 
 

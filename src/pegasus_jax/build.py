@@ -1,5 +1,6 @@
 """Config -> Experiment. The only place that matches on the kind of a setting."""
 
+import math
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
@@ -12,12 +13,13 @@ from jax.sharding import Mesh
 from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco, scenarios, tasks, trial
 from pegasus_jax import config as settings
 from pegasus_jax.cost import of_particles
+from pegasus_jax.course import Course, either, narrowing, pace
 from pegasus_jax.dynamics.bnn import bnn
 from pegasus_jax.dynamics.ensemble import ensemble
 from pegasus_jax.dynamics.gp import gp
 from pegasus_jax.dynamics.lagrangian import lagrangian
 from pegasus_jax.dynamics.ssgp import ssgp
-from pegasus_jax.fit import minibatches
+from pegasus_jax.fit import falling, minibatches
 from pegasus_jax.lbfgs import full_data
 from pegasus_jax.mesh import Spread, over_particles, together
 from pegasus_jax.noisy import HEADS
@@ -27,7 +29,7 @@ from pegasus_jax.policy.rbf import rbf
 from pegasus_jax.policy.squash import SQUASHES, to_limits
 from pegasus_jax.population import best_of
 from pegasus_jax.rollout import NoiseUse, rollout
-from pegasus_jax.search import keeping_best, narrowing, objective, particles, remembering
+from pegasus_jax.search import keeping_best, objective, particles, remembering
 from pegasus_jax.types import (
     Array,
     Dropout,
@@ -106,14 +108,6 @@ def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
     return minibatches(dynamics, optax.adam(rate), batch=config.batch, reset=config.reset)
 
 
-def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
-    """A step size that falls from `rate` to `decay` of it over `steps` updates, as half a cosine, and begins again."""
-    if decay == 1:
-        return rate
-    fall = optax.cosine_decay_schedule(rate, steps, alpha=decay)
-    return lambda count: fall(jnp.asarray(count) % steps)
-
-
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]  # (key, policy parameters, belief) -> cost [H, K] too
 
 
@@ -137,31 +131,43 @@ def search_of(
     if search.risk < 1:
         aggregate = cost.worst(search.risk, aggregate)
     blocks = blocks_of(search.particles, task, dynamics, policy, balanced=search.balanced, spread=spread)
-    pieces: dict[str, Any] = dict(
-        dynamics=dynamics, policy=policy, match=moments.match if search.match else moments.keep, noise=noise
-    )
+    pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
     # A particle's cost is 1 / K of the objective.
     limit = None if search.limit is None else search.limit / search.particles
     ends: dict[str, Any] = dict(aggregate=discounted(search, aggregate), truncate=search.truncate, limit=limit)
+    match = moments.match if search.match else moments.keep
     costs = costs_of(search, task)
+    # The last part of a search is for refining: no matching, each particle's own cost, at its own width.
+    refine = round((1 - search.refine) * search.steps) if search.refine else None
+    narrow = (search.steps if refine is None else refine) / 2 if search.widen > 1 else 0
+    width = narrowing(search.widen, narrow) if narrow else None
 
-    def value(params: Params, belief: Params, given: Scenarios, *width: Array) -> Array:
-        return objective(params, belief, given, **pieces, **ends, cost=costs(*width))
+    def value(params: Params, belief: Params, given: Scenarios, iteration: Array) -> Array:
+        refining = None if refine is None else iteration >= refine
+        cost = costs(refining, width and width(iteration))
+        return objective(
+            params, belief, given, **pieces, **ends, match=either(refining, moments.keep, match), cost=cost
+        )
 
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
-    optimizer = optax.chain(clip, optax.adam(falling(search.learning_rate, search.decay, search.steps)))
+    optimizer = optax.chain(clip, optax.adam(search.learning_rate))
     searcher = particles(
         value,
         remembering(optimizer) if search.best else optimizer,
         blocks=blocks,
         period=Period(**vars(search.period)),
-        width=narrowing(search.widen, search.steps / 2) if search.widen > 1 else None,
+        course=Course(
+            stage=jnp.asarray,
+            pace=pace(search.steps, search.decay, refine),
+            settled=math.ceil(narrow) if refine is None else refine,
+            refine=refine,
+        ),
     )
     if search.best:
         searcher = keeping_best(searcher, search.steps)
     if search.starts > 1:
         searcher = best_of(searcher, policy.init, starts=search.starts, last=search.steps)
-    return searcher, partial(imagined, **pieces, blocks=blocks, cost=task.cost)
+    return searcher, partial(imagined, **pieces, match=match, blocks=blocks, cost=task.cost)
 
 
 def analytic_search_of(
@@ -207,8 +213,8 @@ def analytic_search_of(
     return pilco.analytic(value, noise_std), imagine
 
 
-def costs_of(search: settings.Search, task: Task) -> Callable[..., Callable[[Array], Array]]:
-    """(a factor of the cost's width, or nothing) -> what makes costs of imagined states; as the search says.
+def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Array | None], Callable[[Array], Array]]:
+    """(whether this refines, a factor of the cost's width; None: never) -> costs [H, K] of states [H, K, D].
 
     Raises SettingError where the task's cost has no expectation or no width.
     """
@@ -220,9 +226,12 @@ def costs_of(search: settings.Search, task: Task) -> Callable[..., Callable[[Arr
             " the nearest is 1"
         )
 
-    def costs(*width: Array) -> Callable[[Array], Array]:
-        of_state, expected = task.widened(*width) if task.widened and width else (task.cost, task.expected_cost)
-        return cost.of_matched(expected) if search.cost == "matched" and expected else cost.of_particles(of_state)
+    def costs(refining: Array | None, width: Array | None) -> Callable[[Array], Array]:
+        of_state, expected = task.cost, task.expected_cost
+        if width is not None and task.widened is not None:
+            of_state, expected = task.widened(width)
+        each = cost.of_particles(of_state)
+        return either(refining, each, cost.of_matched(expected)) if search.cost == "matched" and expected else each
 
     return costs
 

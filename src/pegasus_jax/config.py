@@ -1,7 +1,6 @@
 """Every setting, typed, with its default and its limits. Frozen and hashable: a config is a key.
 
-Values are checked when a config is made, and a bad one raises
-`SettingError` with one line that names the setting, the value and what was expected.
+Values are checked when a config is made; a bad one raises `SettingError`, which names it and what was expected.
 """
 
 import dataclasses
@@ -277,6 +276,7 @@ class Search:
     aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
     discount: float = setting(1.0, "weight of a later step against the one before")
     cost: str = setting("matched", "expected one of the matched Gaussian, or of each of the particles: particles")
+    refine: float = setting(0.0, "last part of a search: refines the better of what it found and the old policy")
     widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
@@ -292,24 +292,22 @@ class Search:
 
     def __post_init__(self) -> None:
         _kind("search", self.kind, "particles")
-        _within("search.steps", self.steps, 1)
-        _within("search.particles", self.particles, 2)
+        for name, least in (("steps", 1), ("particles", 2), ("widen", 1), ("starts", 1)):
+            _within(f"search.{name}", getattr(self, name), least)
         _within("search.learning_rate", self.learning_rate, 0, open_low=True)
         _within("search.decay", self.decay, 0, 1)
-        if self.clip is not None:
-            _within("search.clip", self.clip, 0, open_low=True)
         _choice("search.aggregate", self.aggregate, AGGREGATES)
         _within("search.discount", self.discount, 0, 1, open_low=True)
         _choice("search.cost", self.cost, COSTS)
         _within("search.risk", self.risk, 0, 1, open_low=True)
         if self.risk < 1 and self.cost == "matched":
             raise SettingError(f"search.risk={self.risk:g} needs the cost of each particle: search.cost=particles")
-        _within("search.widen", self.widen, 1)
+        _within("search.refine", self.refine, 0, 1)
         if self.truncate is not None:
             _within("search.truncate", self.truncate, 1)
-        if self.limit is not None:
-            _within("search.limit", self.limit, 0, open_low=True)
-        _within("search.starts", self.starts, 1)
+        for name, value in (("clip", self.clip), ("limit", self.limit)):
+            if value is not None:
+                _within(f"search.{name}", value, 0, open_low=True)
         if self.starts > 1 and not self.reset:
             raise SettingError(f"search.starts={self.starts} begins every search anew; it needs search.reset=true")
         for name in ("policy_noise", "state_noise", "cost_noise"):

@@ -56,6 +56,14 @@ def fit(
     return learner, FitInfo(jnp.mean(losses[-tenth:]), jnp.mean(losses[:tenth]), skipped(learner.optimizer) - before)
 
 
+def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
+    """A step size that falls from `rate` to `decay` of it over `steps` updates, as half a cosine, and begins again."""
+    if decay == 1:
+        return rate
+    fall = optax.cosine_decay_schedule(rate, steps, alpha=decay)
+    return lambda count: fall(jnp.asarray(count) % steps)
+
+
 def minibatches(
     dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch: int, reset: bool = False
 ) -> Fitter:

@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import optax
 
 from pegasus_jax import cost as costs
+from pegasus_jax.course import Course
 from pegasus_jax.fit import guarded, skipped
 from pegasus_jax.rollout import NoiseUse, rollout
 from pegasus_jax.scenarios import Blocks, draw, redraw
 from pegasus_jax.types import Array, Begin, Dynamics, Key, Learner, Params, Period, Policy, Scenarios, Searcher
-
-Schedule = Callable[[Array | int], Array]  # iteration -> a factor of the width of the cost
 
 
 class Remembering(NamedTuple):
@@ -78,6 +77,24 @@ def objective(
     return aggregate(cost(imagined.seen))
 
 
+class Started(NamedTuple):
+    """State of an optimiser that remembers where it started."""
+
+    inner_state: optax.OptState
+    start: Params
+
+
+def started(optimizer: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
+    """The optimiser, which also keeps the parameters that a search started from; see `optimise`."""
+    optimizer = optax.with_extra_args_support(optimizer)
+
+    def update(updates: Params, state: Any, params: Params = None, **extra: Any) -> tuple[Params, Any]:
+        updates, inner = optimizer.update(updates, state.inner_state, params, **extra)
+        return updates, Started(inner, state.start)
+
+    return optax.GradientTransformationExtraArgs(lambda params: Started(optimizer.init(params), params), update)  # type: ignore[arg-type]
+
+
 def optimise(
     key: Key,
     learner: Learner,
@@ -89,30 +106,45 @@ def optimise(
     optimizer: optax.GradientTransformation,
     steps: int,
     first: Array | int = 0,
-    width: Schedule | None = None,
+    course: Course = Course(),
     begin: Begin | None = None,
 ) -> tuple[Learner, SearchInfo]:
     """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 19).
 
-    One call of n steps and two calls of n/2, the second with first=n/2, do the same. With a `width`, the objective
-    takes one more argument, its value at the iteration.
+    One call of n steps and two calls of n/2, the second with first=n/2, do the same. With a stage in the `course`, the
+    objective takes one more argument, the stage of the iteration; a course that refines needs a `started` optimiser.
     """
     first = jnp.asarray(first, jnp.int32)
     optimizer = optax.with_extra_args_support(optimizer)
 
     def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], tuple[Array, Array]]:
         learner, scenarios = carry
-        value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios, *_at(width, i))
+        if course.refine is not None:
+            learner = jax.lax.cond(i == course.refine, better, lambda learner, *_: learner, learner, scenarios, i)
+        value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios, *course.at(i))
         # A wider cost is a lower one: its value says nothing about which parameters are best.
-        known = value if width is None else jnp.where(width(i) > 1, jnp.inf, value)
+        known = jnp.where(i < course.settled, jnp.inf, value) if course.settled else value
         updates, state = optimizer.update(gradient, learner.optimizer, learner.params, value=known)
+        if course.pace is not None:
+            updates = optax.tree.scale(course.pace(i), updates)
         learner = Learner(optax.apply_updates(learner.params, updates), state)
         scenarios = redraw(key, i + 1, scenarios, belief)
         return (learner, scenarios), (value, optax.tree.norm(gradient))
 
+    def better(learner: Learner, scenarios: Scenarios, i: Array) -> Learner:
+        """The learner at its parameters or at those it was given; a tie, or NaN, goes to these."""
+        old = optax.tree.get(learner.optimizer, "start")
+        both = jax.tree.map(lambda *leaves: jnp.stack(leaves), old, learner.params)
+        of_old, of_new = jax.lax.map(lambda params: objective(params, belief, scenarios, *course.at(i)), both)
+        return learner._replace(params=jax.tree.map(partial(jnp.where, of_new < of_old), learner.params, old))
+
     scenarios = draw(key, first, belief)
+    given = learner.params
     if begin is not None:
-        learner = at_first(first, begin, learner, lambda params: objective(params, belief, scenarios, *_at(width, 0)))
+        learner = at_first(first, begin, learner, lambda params: objective(params, belief, scenarios, *course.at(0)))
+    if course.refine is not None:
+        kept = jax.tree.map(partial(jnp.where, first == 0), given, optax.tree.get(learner.optimizer, "start"))
+        learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, start=kept))
     before = skipped(learner.optimizer)
     (learner, _), (values, norms) = jax.lax.scan(step, (learner, scenarios), first + jnp.arange(steps))
     return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
@@ -126,34 +158,22 @@ def at_first(first: Array | int, begin: Begin, learner: Learner, value: Callable
     return jax.lax.cond(jnp.asarray(first) == 0, lambda old: begin(old, value), lambda old: old, learner)
 
 
-def narrowing(widest: float, over: float) -> Schedule:
-    """A factor of the cost's width that falls from `widest` at iteration 0 to 1 at iteration `over`, geometrically."""
-    return lambda i: widest ** jnp.maximum(0.0, 1 - i / over)
-
-
-def _at(width: Schedule | None, i: Array | int) -> tuple[Array, ...]:
-    return () if width is None else (width(i),)
-
-
 def particles(
     objective: Callable[..., Array],
     optimizer: optax.GradientTransformation,
     *,
     blocks: Blocks,
     period: Period,
-    width: Schedule | None = None,
+    course: Course = Course(),
 ) -> Searcher:
-    """The searcher that follows the gradient of `objective` under scenarios drawn from `blocks`, held for `period`.
-
-    The objective takes (policy parameters, belief, scenarios) and, with a `width`, its value at the iteration.
-    """
-    optimizer = guarded(optimizer)
+    """The searcher that follows the gradient of `objective` under scenarios drawn from `blocks`, held for `period`."""
+    optimizer = guarded(optimizer if course.refine is None else started(optimizer))
     pieces: dict[str, Any] = dict(
         draw=partial(draw, blocks=blocks, period=period),
         redraw=partial(redraw, blocks=blocks, period=period),
         objective=objective,
         optimizer=optimizer,
-        width=width,
+        course=course,
     )
     return Searcher(init=optimizer.init, run=partial(optimise, **pieces))
 
@@ -166,12 +186,12 @@ def keeping_best(searcher: Searcher, last: int) -> Searcher:
     """
 
     def run(
-        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, begin: Begin | None = None
+        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, **more: Any
     ) -> tuple[Learner, Any]:
         known = optax.tree.get(learner.optimizer, "best_value")
         known = jnp.where(jnp.asarray(first) == 0, jnp.inf, known)  # what an older model thought does not count
         learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, best_value=known))
-        learner, info = searcher.run(key, learner, belief, first=first, steps=steps, begin=begin)
+        learner, info = searcher.run(key, learner, belief, first=first, steps=steps, **more)
         best = optax.tree.get(learner.optimizer, "best_params")
         kept = jax.tree.map(partial(jnp.where, first + steps >= last), best, learner.params)
         return learner._replace(params=kept), info

@@ -104,19 +104,22 @@ def save(config: Config, path: Path) -> None:
 
 
 def load(path: Path) -> Config:
-    """The config that `save` wrote. Raises SettingError when it is not one."""
+    """The config that `save` wrote. Raises SettingError when it is not one.
+
+    A setting that the file lacks is younger than the run, and its default leaves everything as it was.
+    """
     try:
         stored: Any = OmegaConf.to_container(OmegaConf.load(path))
     except (OSError, ValueError, OmegaConfBaseException, YAMLError) as error:
         raise SettingError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
-    if not isinstance(stored, dict):
+    if not isinstance(stored, dict) or "task" not in stored:
         raise SettingError(f"{path} is not the config of a run")
     chosen = {section: stored.get(f"{section}.kind") for section in KINDS}
     for section, kind in chosen.items():
         if kind not in (None, *KINDS[section]):
             raise SettingError(f"{path}: {section}.kind={kind} is unknown; {nearest(kind, KINDS[section])}")
     config = Config(**{section: KINDS[section][kind] for section, kind in chosen.items() if kind is not None})
-    wrong = sorted(set(map(str, stored)) ^ set(leaves(config)))
+    wrong = sorted(set(map(str, stored)) - set(leaves(config)))
     if wrong:
         raise SettingError(f"{path} is not the config of a run of this version: see {', '.join(wrong[:5])}")
     try:

@@ -1,0 +1,49 @@
+"""What changes over the iterations of a search: the width of its cost, its step size, whether it refines."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from pegasus_jax.types import Array
+
+Schedule = Callable[[Array | int], Array]  # of the iteration, from 0
+
+
+class Course(NamedTuple):
+    """How a search goes on. By default every iteration is like the first."""
+
+    stage: Schedule | None = None  # what the objective is told of the iteration
+    pace: Schedule | None = None  # a factor of the step
+    settled: int = 0  # the iteration from which the objective is what the search is for
+    refine: int | None = None  # that at which it goes back to the parameters it was given, unless it found better ones
+
+    def at(self, i: Array | int) -> tuple[Array, ...]:
+        """What the objective of iteration i is told beyond policy parameters, belief and scenarios."""
+        return () if self.stage is None else (self.stage(i),)
+
+
+def narrowing(widest: float, over: float) -> Schedule:
+    """A factor of the cost's width that falls from `widest` at iteration 0 to 1 at iteration `over`, geometrically."""
+    return lambda i: widest ** jnp.maximum(0.0, 1 - i / over)
+
+
+def pace(steps: int, decay: float, refine: int | None = None) -> Schedule | None:
+    """A factor of the step size: over a search it falls from 1 to `decay`, as half a cosine; None if it is always 1.
+
+    From the iteration `refine` on it falls from 1 once more, to .03.
+    """
+    if refine is None and decay == 1:
+        return None
+    last = steps if refine is None else refine
+    fall = optax.cosine_decay_schedule(1.0, max(last, 1), decay)
+    again = optax.cosine_decay_schedule(1.0, max(steps - last, 1), 0.03)
+    return lambda i: jnp.where(i < last, fall(i), again(i - last))
+
+
+def either(condition: Array | None, yes: Callable[..., Array], no: Callable[..., Array]) -> Callable[..., Array]:
+    """The function that is `yes` where the condition holds and else `no`; without a condition, `no`."""
+    return no if condition is None else partial(jax.lax.cond, condition, yes, no)
