@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from pegasus_jax import settings
+from pegasus_jax.program import share_processors
 from pegasus_jax.record import about
 from pegasus_jax.study import seed_list, study, table, write
 
@@ -23,7 +24,9 @@ def main(words: list[str]) -> None:
     config = settings.parse(dotted)
     path = RESULTS / f"{name}.json"
     RESULTS.mkdir(exist_ok=True)
-    result = study(config, seed_list(options.get("seeds", "0-9")), path)
+    seeds = seed_list(options.get("seeds", "0-9"))
+    share_processors(len(seeds))
+    result = study(config, seeds, path)
     result["about"] = about(shlex.join(["python", "-m", "benchmarks.study", *words]))
     write(path, result)
     print(f"## {name}: compiled in {result['compile_seconds']} s, ran {result['run_seconds']} s")

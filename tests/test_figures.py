@@ -15,6 +15,7 @@ from pegasus_jax.report import claims, comparison
 from pegasus_jax.report.curves import interval, middle
 from pegasus_jax.report.figures import Claim, Figure, read
 from pegasus_jax.study import first_solved, seed_list, short, study
+from probes import unchecked
 from test_train import call
 
 FILES = {path.stem: path for path in sorted(results_page.FIGURES.glob("*.toml"))}
@@ -181,6 +182,19 @@ def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
     assert {path: path.read_bytes() for path in out.glob("*.json")} == both
     assert "mine-loose.json was made with search.clip=1.0, not 7.0" in third.stderr
     assert (out / "mine.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.usefixtures("quick_compile")
+def test_the_cores_of_a_processor_share_the_seeds_of_a_study(tmp_path):
+    """The command makes a device of each of two cores; here there is one. The numbers are those of one program."""
+    figure = figure_of(tmp_path, TINY)
+    command = call("figures", "mine.toml", "out=there", "variants=loose", cwd=tmp_path, JAX_NUM_CPU_DEVICES="2")
+    assert command.returncode == 0, command.stderr
+    shared = json.loads((tmp_path / "there" / "mine-loose.json").read_text())
+    assert len(shared["about"]["devices"]) == 2
+    alone = unchecked(study)(comparison.configs(figure)["loose"], [3, 4])
+    for name in ("mean_cost", "episode_cost"):
+        np.testing.assert_allclose(shared[name], alone[name], atol=5e-3)
 
 
 # What comes out

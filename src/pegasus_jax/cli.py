@@ -150,11 +150,12 @@ def _train(words: Sequence[str]) -> None:
     if len(runs) > 1 and config.task == tasks.GYM:
         raise SettingError(f"seeds={len(runs)} is too many for task=gym, whose environment is one object; seeds=1")
     _join(options)
+    from pegasus_jax.program import leads, share_processors
+
     if not {"mesh", "distributed", "coordinator"} & {*options}:
-        _share_processors(len(runs))
+        share_processors(len(runs))
     over = _mesh(options.get("mesh"), len(runs))
     from pegasus_jax.build import build, set_precision
-    from pegasus_jax.program import leads
 
     set_precision(config)
     build(replace(config, seed=0), over)  # so that impossible settings end here, before anything is written
@@ -189,21 +190,6 @@ def _join(options: dict[str, str]) -> None:
             jax.distributed.initialize()  # SLURM, Open MPI and others say where the coordinator is
     except (RuntimeError, ValueError) as error:
         raise SettingError(f"distributed=true: {str(error).splitlines()[0]}; or give coordinator=HOST:PORT") from error
-
-
-def _share_processors(seeds: int) -> None:
-    """Where a CPU does the work, make a device of as many of its cores as share the seeds evenly, unless JAX was told.
-
-    One program for all seeds hardly uses a second core: a seed's matrices are too small to be shared.
-    """
-    import jax
-
-    from pegasus_jax.record import processors
-
-    asked = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
-    told = asked > 0 or "xla_force_host_platform" in os.environ.get("XLA_FLAGS", "")
-    if not told:
-        jax.config.update("jax_num_cpu_devices", max(n for n in range(1, processors() + 1) if seeds % n == 0))
 
 
 def _mesh(text: str | None, seeds: int) -> Any:
@@ -267,8 +253,10 @@ def _play(words: Sequence[str]) -> None:
 
 def _figures(words: Sequence[str]) -> None:
     from pegasus_jax import settings
+    from pegasus_jax.program import share_processors
     from pegasus_jax.report import claims, comparison
     from pegasus_jax.report.figures import read
+    from pegasus_jax.study import seed_list
 
     files = [word for word in words if "=" not in word]
     if len(files) != 1:
@@ -277,6 +265,7 @@ def _figures(words: Sequence[str]) -> None:
     asked: dict[str, Any] = dict(seeds=options.get("seeds", ""), changes=[f"{k}={v}" for k, v in changed.items()])
     only = [label for label in options.get("variants", "").split(",") if label]
     figure, out = read(Path(files[0])), Path(options.get("out", "runs/figures"))
+    share_processors(len(seed_list(asked["seeds"] or figure.seeds)))
     there = comparison.run(figure, out, only=only, command=shlex.join(["pegasus-figures", *words]), **asked)
     for line in comparison.differences(figure, there, **asked):
         print(line, file=sys.stderr)

@@ -1,5 +1,6 @@
 """The compiled parts of an experiment, for one seed or for many at once, and the clock on them."""
 
+import os
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -13,6 +14,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
 from pegasus_jax import mesh
+from pegasus_jax.record import processors
 from pegasus_jax.types import Experiment
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
@@ -103,6 +105,18 @@ class Program:
         """Seconds spent in each part since the last call."""
         spent, self.spent = self.spent, {}
         return {name: round(spent.get(name, 0.0), 3) for name in NAMES}
+
+
+def share_processors(seeds: int) -> None:
+    """Where a CPU does the work, make a device of as many of its cores as share the seeds evenly, unless JAX was told.
+
+    One program for all seeds hardly uses a second core: a seed's matrices are too small to be shared. To be called
+    before JAX has looked for devices.
+    """
+    asked = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
+    told = asked > 0 or "xla_force_host_platform" in os.environ.get("XLA_FLAGS", "")
+    if not told:
+        jax.config.update("jax_num_cpu_devices", max(n for n in range(1, processors() + 1) if seeds % n == 0))
 
 
 def over_seeds(function: Callable[..., Any], axes: tuple[int | None, ...], *, seeds: int) -> Callable[..., Any]:

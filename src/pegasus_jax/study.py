@@ -1,6 +1,7 @@
 """Learning studies: every seed of a configuration in one vmapped program, every curve kept raw."""
 
 import json
+import math
 import sys
 import time
 from functools import partial
@@ -11,9 +12,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax import settings
+from pegasus_jax import mesh, settings
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.config import Config, SettingError
+from pegasus_jax.program import described
 from pegasus_jax.record import write_whole
 from pegasus_jax.tasks import GYM
 from pegasus_jax.train import saturated, succeeded
@@ -37,14 +39,21 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
         )
     set_precision(config)
     experiment = build(config)
+    over = mesh.mesh(math.gcd(len(seeds), jax.device_count()), 1)
+    each = partial(jax.vmap, spmd_axis_name=mesh.SEEDS)
+    # What lies where: a seed's own on the devices for seeds, the number of the trial on all.
+    own, all_the_same = (None, None) if over is None else (mesh.over_seeds(over), mesh.shared(over))
+    laid_out = RunState(own, own, own, own, all_the_same)  # type: ignore[arg-type]
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
-    states = jax.jit(jax.vmap(experiment.init, out_axes=SEEDS))(keys)
+    states = jax.jit(each(experiment.init, out_axes=SEEDS), out_shardings=laid_out)(keys)
     began = time.monotonic()
-    lowered = jax.jit(jax.vmap(lambda state: trial(state, experiment), (SEEDS,), (SEEDS, 0))).lower(states)
+    one = each(lambda state: trial(state, experiment), (SEEDS,), (SEEDS, 0))
+    lowered = jax.jit(one, out_shardings=(laid_out, own)).lower(states)
     program = lowered.compile()
     # A program of its own, so that looking changes no number.
-    look = jax.jit(jax.vmap(partial(diagnosed, experiment), (SEEDS, SEEDS, 0)))
-    look = look.lower(states, states, lowered.out_info[1]).compile()
+    infos = lowered.out_info[1] if own is None else described(lowered.out_info[1], own)
+    look = jax.jit(each(partial(diagnosed, experiment), (SEEDS, SEEDS, 0)), out_shardings=own)
+    look = look.lower(states, states, infos).compile()
     compiled = time.monotonic()
     infos, looks, result = [], [], {}
     for count in range(1, config.trials + 1):
