@@ -159,6 +159,25 @@ def test_all_checkpoints_damaged_starts_from_the_episodes(whole: Path, tmp_path:
     assert fingerprint(run) == fingerprint(whole)
 
 
+def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_path: Path) -> None:
+    """As those of an older version may be, whose optimiser kept other things. Resuming begins with the data."""
+    run = copy_until(whole, tmp_path / "run", 2)
+    config = run / "config.yaml"
+    config.write_text(config.read_text().replace("search.best: false", "search.best: true"))
+    refused = call("evaluate", str(run), cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "no checkpoint that this version can use" in refused.stderr.splitlines()[-1]
+    done = call("train", f"resume={run}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "of another version or of other settings" in done.stderr
+    for trial in (1, 2):
+        one, other = record.load_episode(run, trial), record.load_episode(whole, trial)
+        assert one is not None
+        assert other is not None
+        np.testing.assert_array_equal(one.x, other.x)
+    assert call("evaluate", str(run), cwd=tmp_path).returncode == 0
+
+
 def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:
     run = copy_until(whole, tmp_path / "run", 9)
     done = call("train", f"resume={run}", "trials=4", cwd=tmp_path)

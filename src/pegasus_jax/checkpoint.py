@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax.record import write_json
+from pegasus_jax.record import RunError, write_json
 from pegasus_jax.types import Key, RunState
 
 
@@ -47,10 +47,16 @@ def damage(run: Path, trial: int) -> str | None:
 
 
 def restore(run: Path, trial: int, like: RunState) -> RunState:
-    """The state after a trial; `like` is a state of the same experiment (shapes are enough: eval_shape of init)."""
+    """The state after a trial; `like` is a state of the same experiment (shapes are enough: eval_shape of init).
+
+    Raises RunError when it is the state of another experiment, or of a version that kept other things.
+    """
     target = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(_plain, like))
-    with _checkpointer() as checkpointer:
-        state = jax.tree.map(jnp.asarray, checkpointer.restore(_folder(run, trial), target))
+    try:
+        with _checkpointer() as checkpointer:
+            state = jax.tree.map(jnp.asarray, checkpointer.restore(_folder(run, trial), target))
+    except ValueError as error:
+        raise RunError(f"{_folder(run, trial)} is of another version or of other settings") from error
     return state._replace(key=jax.random.wrap_key_data(state.key))
 
 

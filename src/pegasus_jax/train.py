@@ -234,8 +234,12 @@ def together(runs: Sequence[Path], config: Config, display: Display) -> RunState
         problems = [problem for run in runs if (problem := checkpoint.damage(run, trial)) is not None]
         if not problems:
             like = jax.eval_shape(build(config).init, jax.random.key(0))
-            states = [checkpoint.restore(run, trial, like) for run in runs]
-            return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+            try:
+                states = [checkpoint.restore(run, trial, like) for run in runs]
+            except RunError as error:
+                problems = [str(error)]
+            else:
+                return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
         for problem in problems:
             display.line(f"checkpoint {trial} is not usable: {problem}; going on from the one before it")
     return None
@@ -247,7 +251,7 @@ def newest(run: Path) -> tuple[Config, Experiment, RunState]:
     set_precision(config)
     states = together([run], config, Display(config.trials, 0))
     if states is None:
-        raise RunError(f"{run} has no whole checkpoint yet")
+        raise RunError(f"{run} has no checkpoint that this version can use yet; resume={run} makes one")
     return config, build(config), part(states, 0)
 
 
