@@ -1,0 +1,218 @@
+"""What a config says of a search reaches the search: its objective, its gradient, its course."""
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from pegasus_jax import config, cost, moments, scenarios, types
+from pegasus_jax.build import (
+    compose,
+    dynamics_of,
+    fit_of,
+    start,
+)
+from pegasus_jax.config import Period, SettingError
+from pegasus_jax.fit import falling
+from pegasus_jax.search import objective
+from pegasus_jax.trial import SEARCH, trial_key
+from pegasus_jax.types import Dataset, Learner
+from probes import PENDULUM, cart, known, linear_policy, tiny
+
+pytestmark = pytest.mark.usefixtures("quick_compile")
+
+
+def eagerly(function):
+    """Operation by operation: for one step of a tiny search, nine times faster than compiling it."""
+
+    def call(*arguments):
+        with jax.disable_jit():
+            return function(*arguments)
+
+    return call
+
+
+def searcher(gain=-0.5, **search):
+    """An experiment under a config, its first state, and a one-step search from it."""
+    chosen = dataclasses.replace(
+        tiny(), search=config.Search(**{"steps": 1, "particles": 5, "cost": "particles", "widen": 1.0, **search})
+    )
+    policy = linear_policy(2, 1)._replace(init=lambda key: gain * jnp.array([[1.0, 1.6]]))
+    exp = compose(chosen, cart(horizon=2), dynamics=known(PENDULUM, noise_std=0.2), policy=policy)
+    return exp, exp.init(jax.random.key(0)), eagerly(exp.search)
+
+
+def first_objective(**search):
+    _, state, run = searcher(**search)
+    return float(run(state)[1].objective[0])
+
+
+def test_settings_of_the_search_reach_the_objective():
+    plain = first_objective()
+    changes = dict(match=False, balanced=True, discount=0.5, aggregate="total", risk=0.4, cost="matched", widen=2.0)
+    values = {name: first_objective(**{name: value}) for name, value in changes.items()}
+    np.testing.assert_allclose(values.pop("aggregate"), 2 * plain, rtol=1e-4)  # the sum over 2 steps
+    assert values["discount"] < 0.9 * plain
+    assert values["risk"] > 1.01 * plain  # the worst two of five
+    assert all(abs(value - plain) > 1e-6 for value in values.values()), values
+    assert len(set(values.values())) == len(values)
+
+
+@pytest.mark.parametrize("of", ["particles", "matched"])
+def test_a_search_starts_with_the_wider_cost_and_ends_with_the_tasks(of):
+    """A cost twice as wide is the task's cost of half the error; from half of the search on it is the task's own."""
+    wide = float(searcher(cost=of, widen=2.0)[2](searcher(cost=of)[1])[1].objective[0])
+    halved = cart(horizon=2)._replace(
+        cost=cost.saturating(lambda x: x / 2, 1.0), expected_cost=cost.expected_saturating(lambda x: x / 2, 1.0, ())
+    )
+    chosen = dataclasses.replace(tiny(), search=config.Search(steps=1, particles=5, cost=of, widen=1.0))
+    exp, state, _ = searcher()
+    by_hand = compose(chosen, halved, dynamics=exp.dynamics, policy=exp.policy).search
+    np.testing.assert_allclose(wide, eagerly(by_hand)(state)[1].objective[0], rtol=1e-5)
+    slow = dict(cost=of, steps=4, learning_rate=1e-30)
+    narrowed, plain = (searcher(**slow, widen=widen) for widen in (2.0, 1.0))
+    values = [run(state)[1].objective for _, state, run in (narrowed, plain)]
+    np.testing.assert_allclose(values[0][2:], values[1][2:], rtol=1e-5)
+    assert np.all(values[0][:2] < 0.9 * values[1][:2])
+
+
+HELD = dict(steps=4, period=Period(0, 0, 0, 0, 0))  # the same scenarios for every iteration
+ALONE = dict(match=False, restart=False, **HELD)
+
+
+def test_a_search_that_lost_its_way_refines_the_policy_it_was_given():
+    """With steps of 10 the matched half is of no use. What refines has no matching, and each particle's own cost."""
+    _, state, run = searcher(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
+    (after, info), (_, _, alone) = run(state), searcher(learning_rate=1e-30, **ALONE)
+    np.testing.assert_allclose(info.objective[2], alone(state)[1].objective[0], rtol=1e-5)
+    assert np.any(after.policy.params != state.policy.params)
+
+
+def test_a_search_that_found_a_better_policy_refines_that():
+    better = dict(cost="matched", widen=1.0, learning_rate=0.02)
+    _, state, run = searcher(gain=-0.1, refine=0.5, **better, **HELD)
+    _, info = run(state)
+    exp, _, _ = searcher(gain=-0.1, **better, **HELD)
+    found, _ = eagerly(partial(exp.search, steps=2))(state)
+    _, _, alone = searcher(learning_rate=1e-30, **ALONE)
+    np.testing.assert_allclose(info.objective[2], alone(found)[1].objective[0], rtol=1e-5)
+    assert info.objective[2] < alone(state)[1].objective[0]
+
+
+def test_a_refining_search_in_parts_is_the_whole():
+    exp, state, run = searcher(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
+    part, parts = eagerly(partial(exp.search, steps=1)), state
+    for first in range(4):
+        parts, _ = part(parts, first)
+    np.testing.assert_allclose(parts.policy.params, run(state)[0].policy.params, rtol=1e-6)
+
+
+def test_a_cost_without_a_width_cannot_be_widened():
+    task = cart(horizon=2)._replace(widened=None)
+    with pytest.raises(SettingError, match=r"search\.widen=4 needs a cost with a width.*the nearest is 1"):
+        compose(tiny(), task)
+
+
+def test_truncation_reaches_the_gradient_and_only_that():
+    (_, state, run), (_, _, cut) = searcher(), searcher(truncate=1)
+    (_, plain), (_, truncated) = run(state), cut(state)
+    assert plain.objective[0] == truncated.objective[0]
+    assert abs(plain.gradient_norm[0] - truncated.gradient_norm[0]) > 1e-3
+
+
+def test_a_limit_reaches_the_gradient_as_a_share_of_each_particle():
+    (_, state, run), (_, _, limited), (_, _, loose) = searcher(), searcher(limit=1e-3), searcher(limit=1e6)
+    plain, short, same = (f(state)[1] for f in (run, limited, loose))
+    assert plain.objective[0] == short.objective[0]
+    assert short.gradient_norm[0] < 0.9 * plain.gradient_norm[0]
+    np.testing.assert_allclose(same.gradient_norm[0], plain.gradient_norm[0], rtol=1e-5)
+
+
+def test_a_step_size_falls_as_half_a_cosine_and_begins_again():
+    rate = falling(2.0, 0.1, 100)
+    sizes = [float(rate(i)) for i in (0, 50, 99, 100, 150)]
+    np.testing.assert_allclose(sizes, [2.0, 1.1, 0.2, 2.0, 1.1], atol=1e-3)
+    assert falling(2.0, 1.0, 100) == 2.0
+
+
+def test_a_falling_step_size_reaches_the_search():
+    """Adam's first step is as long as the step size; of three that fall to nothing the others are 3/4 and 1/4 of it."""
+    moved = {}
+    for decay in (1.0, 0.0):
+        _, state, run = searcher(steps=3, decay=decay, learning_rate=1e-4, period=Period(0, 0, 0, 0, 0))
+        moved[decay] = np.abs(run(state)[0].policy.params - state.policy.params)
+    np.testing.assert_allclose(moved[0.0], moved[1.0] * 2 / 3, rtol=0.02)
+
+
+def test_a_falling_step_size_reaches_the_fit():
+    """One row, so that every gradient has the same sign."""
+    dynamics, moved = dynamics_of(config.BNN(hidden=(4,)), cart()), {}
+    row = jnp.ones((1, 2)), jnp.ones((1, 1)), jnp.ones((1, 2))
+    for decay in (1.0, 0.0):
+        fit = fit_of(config.Fit(steps=2, batch=1, decay=decay, learning_rate=1e-5), dynamics)
+        params = dynamics.init(jax.random.key(0))
+        learner, _ = fit.run(jax.random.key(1), Learner(params, fit.init(params)), Dataset(*row, jnp.int32(1)), 2)
+        moved[decay] = np.abs(ravel_pytree(learner.params)[0] - ravel_pytree(params)[0]).max()
+    np.testing.assert_allclose(moved[0.0], moved[1.0] * 3 / 4, rtol=0.05)
+
+
+def test_the_best_parameters_of_a_search_reach_the_policy():
+    """One step: they are those it began with, while the last are one step further."""
+    moved, kept = (searcher(best=best) for best in (False, True))
+    before = moved[1].policy.params
+    assert not np.array_equal(moved[2](moved[1])[0].policy.params, before)
+    state, info = kept[2](kept[1])
+    assert np.array_equal(state.policy.params, before)
+    assert info.gradient_norm[0] > 0
+
+
+def test_each_factor_of_the_noise_reaches_its_place():
+    """What the policy sees decides its controls, the state's own noise the states, the cost's only what it sees."""
+
+    def imagined(**search):
+        exp, state, _ = searcher(**{"match": False, "policy_noise": 0.0, **search})
+        return eagerly(exp.imagine)(state)[0]
+
+    plain = imagined()
+    blur = np.asarray(imagined(cost_noise=1.0).seen - plain.seen)
+    assert np.all(blur != 0)
+    seen = imagined(cost_noise=0.5)
+    assert np.array_equal(seen.x, plain.x)
+    np.testing.assert_allclose(seen.seen - plain.seen, 0.5 * blur, atol=1e-5)
+    moved = imagined(state_noise=0.5)
+    np.testing.assert_allclose(moved.x[1] - plain.x[1], 0.5 * blur[0], atol=1e-5)
+    told = imagined(policy_noise=0.5)
+    np.testing.assert_allclose((told.u - plain.u)[1, :, 0], 0.5 * blur[0] @ np.array([-0.5, -0.8]), atol=1e-5)
+    assert np.array_equal(told.x[1], plain.x[1])
+
+
+def test_as_few_particles_as_are_allowed_do():
+    assert np.isfinite(first_objective(particles=3, balanced=True))
+
+
+def test_clipping_reaches_the_optimiser():
+    """Adam's step hides the size of a gradient; its first moment, a tenth of what it was given, does not."""
+    moved = {}
+    for clip in (None, 1e-6):
+        _, state, run = searcher(clip=clip)
+        state, info = run(state)
+        moved[clip] = float(jnp.linalg.norm(state.policy.optimizer.inner_state[1][0].mu))
+        assert info.gradient_norm[0] > 1e-4
+    np.testing.assert_allclose(moved[None], 0.1 * info.gradient_norm[0], rtol=1e-3)
+    np.testing.assert_allclose(moved[1e-6], 0.1 * 1e-6, rtol=1e-3)
+
+
+def test_the_search_minimises_what_objective_says():
+    """The first objective of a search is `objective` of the public pieces, put together by hand."""
+    exp, state, run = searcher()
+    pieces = dict(dynamics=exp.dynamics, policy=exp.policy)
+    of_task = partial(start, task=exp.task)
+    blocks = scenarios.blocks(**pieces, start=of_task, particles=5, horizon=2, balanced=False)
+    given = scenarios.draw(trial_key(state.key, 0, SEARCH), 0, None, blocks=blocks, period=types.Period())
+    of_particles = cost.of_particles(exp.task.cost)
+    by_hand = objective(state.policy.params, None, given, **pieces, match=moments.match, cost=of_particles)
+    np.testing.assert_allclose(run(state)[1].objective[0], by_hand, rtol=1e-5)
