@@ -338,7 +338,9 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
 def seeking(optimizer, steps, value=jnp.nan, bad=(), last=12):
     """A keeping searcher around `pursue`."""
     init, run = optimizer.init, pursue(optimizer, steps, bad=bad, value=value)
-    searcher = Searcher(init, lambda key, learner, belief, *, first, steps: run(key, learner, belief, first=first))
+    searcher = Searcher(
+        init, lambda key, learner, belief, *, first, steps, begin: run(key, learner, belief, first=first)
+    )
     return keeping_best(searcher, last)
 
 

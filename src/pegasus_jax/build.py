@@ -1,6 +1,5 @@
 """Config -> Experiment. The only place that matches on the kind of a setting."""
 
-import math
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
@@ -145,9 +144,8 @@ def search_of(
     def value(params: Params, belief: Params, given: Scenarios, iteration: Array) -> Array:
         refining = None if refine is None else iteration >= refine
         cost = costs(refining, width and width(iteration))
-        return objective(
-            params, belief, given, **pieces, **ends, match=either(refining, moments.keep, match), cost=cost
-        )
+        onwards = either(refining, moments.keep, match)
+        return objective(params, belief, given, **pieces, **ends, match=onwards, cost=cost)
 
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
@@ -159,7 +157,7 @@ def search_of(
         course=Course(
             stage=jnp.asarray,
             pace=pace(search.steps, search.decay, refine),
-            settled=math.ceil(narrow) if refine is None else refine,
+            settled=narrow if refine is None else refine,
             refine=refine,
         ),
     )
@@ -214,7 +212,7 @@ def analytic_search_of(
 
 
 def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Array | None], Callable[[Array], Array]]:
-    """(whether this refines, a factor of the cost's width; None: never) -> costs [H, K] of states [H, K, D].
+    """(whether this refines, a factor of the cost's width; None: never) -> costs [H, K] or [H, 1] of states [H, K, D].
 
     Raises SettingError where the task's cost has no expectation or no width.
     """
@@ -231,7 +229,9 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
         if width is not None and task.widened is not None:
             of_state, expected = task.widened(width)
         each = cost.of_particles(of_state)
-        return either(refining, each, cost.of_matched(expected)) if search.cost == "matched" and expected else each
+        if search.cost != "matched" or expected is None:
+            return each
+        return either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), cost.of_matched(expected))
 
     return costs
 

@@ -68,8 +68,8 @@ def of_particles(cost: Cost) -> Callable[[Array], Array]:
 
 
 def of_matched(expected: Expected) -> Callable[[Array], Array]:
-    """The expected cost of the Gaussian with the particles' mean and covariance, for each: x [H, K, D] -> [H, K]."""
-    return jax.vmap(lambda x: jnp.broadcast_to(expected(*mean_and_cov(x)), x.shape[:1]))
+    """The expected cost of the Gaussian with the particles' mean and covariance: x [H, K, D] -> [H, 1]."""
+    return jax.vmap(lambda x: expected(*mean_and_cov(x))[None])
 
 
 def mean(costs: Array) -> Array:

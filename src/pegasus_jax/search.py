@@ -186,12 +186,12 @@ def keeping_best(searcher: Searcher, last: int) -> Searcher:
     """
 
     def run(
-        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, **more: Any
+        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, begin: Begin | None = None
     ) -> tuple[Learner, Any]:
         known = optax.tree.get(learner.optimizer, "best_value")
         known = jnp.where(jnp.asarray(first) == 0, jnp.inf, known)  # what an older model thought does not count
         learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, best_value=known))
-        learner, info = searcher.run(key, learner, belief, first=first, steps=steps, **more)
+        learner, info = searcher.run(key, learner, belief, first=first, steps=steps, begin=begin)
         best = optax.tree.get(learner.optimizer, "best_params")
         kept = jax.tree.map(partial(jnp.where, first + steps >= last), best, learner.params)
         return learner._replace(params=kept), info
