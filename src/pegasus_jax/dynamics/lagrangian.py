@@ -99,23 +99,28 @@ def lagrangian(
         """L [n, n] and V [] at q [n]."""
         features = encode((q - belief.units.centre) / belief.units.spread, turning)
         out = network.apply(belief.params["network"], features, masks)
-        lower = jnp.zeros((n, n), out.dtype).at[rows, columns].set(out[:-1])
-        return jnp.tril(lower, -1) + jnp.diag(LEAST_MASS + jax.nn.softplus(1 + jnp.diagonal(lower))), out[-1]
+        entries = jnp.where(rows == columns, LEAST_MASS + jax.nn.softplus(1 + out[:-1]), out[:-1])
+        zero = jnp.zeros((), out.dtype)
+        lower = [entries[i * (i + 1) // 2 + j] if j <= i else zero for i in range(n) for j in range(n)]
+        return jnp.stack(lower).reshape(n, n), out[-1]
 
     def acceleration(belief: Belief, masks: Masks, q: Array, v: Array, u: Array) -> Array:
         """Change of v [n] in a control period; v and u [U] in their units."""
         params, units = belief
         (lower, _), along = jax.linearize(lambda q: energies(belief, masks, q), q)
         slopes, pull = jax.vmap(along)(jnp.diag(units.speed * dt))  # [n, n, n], [n]: of L and V by each coordinate
-        change, momentum = jnp.tensordot(v, slopes, 1), v @ lower  # dL/dt, and L' v
+        # Sums, not matrix products: a few numbers each, they are compiled into one loop over particles.
+        change, momentum = jnp.sum(v[:, None, None] * slopes, 0), jnp.sum(v[:, None] * lower, 0)  # dL/dt, and L' v
         force = params["control"] @ u + params["constant"] - params["resistance"] @ v - pull
-        force += jnp.einsum("ijk,j,k->i", slopes, v, momentum) - change @ momentum - lower @ (v @ change)
+        force += jnp.sum(jnp.sum(slopes * v[:, None], 1) * momentum, 1)
+        force -= jnp.sum(change * momentum + lower * jnp.sum(v[:, None] * change, 0), 1)
         return within(solve(lower, force), GREATEST_CHANGE)
 
     def predict(belief: Belief, masks: Masks, x: Array, u: Array) -> Prediction:
         units, h = belief.units, 1 / substeps
         u = u / units.control
 
+        @jax.checkpoint  # the way back computes this again: cheaper than to store what it needs, stage by stage
         def rate(state: Array) -> Array:
             q, v = state
             return jnp.stack([dt * v, units.speed * acceleration(belief, masks, q, v / units.speed, u)])
@@ -168,10 +173,17 @@ def within(v: Array, limit: Array | float) -> Array:
 def solve(lower: Array, force: Array) -> Array:
     """a [n] with L L' a = force; unrolled, because for a few coordinates a library call costs more than the network."""
     n = force.shape[0]
-    half: list[Array] = []
-    for i in range(n):
-        half.append((force[i] - sum(lower[i, j] * half[j] for j in range(i))) / lower[i, i])
-    whole: dict[int, Array] = {}
-    for i in reversed(range(n)):
-        whole[i] = (half[i] - sum(lower[j, i] * whole[j] for j in range(i + 1, n))) / lower[i, i]
-    return jnp.stack([whole[i] for i in range(n)])
+
+    def product(a: Array) -> Array:
+        return jnp.sum(lower * jnp.sum(lower * a[:, None], 0), 1)
+
+    def substitute(_: Any, force: Array) -> Array:
+        half: list[Array] = []
+        for i in range(n):
+            half.append((force[i] - sum(lower[i, j] * half[j] for j in range(i))) / lower[i, i])
+        whole: dict[int, Array] = {}
+        for i in reversed(range(n)):
+            whole[i] = (half[i] - sum(lower[j, i] * whole[j] for j in range(i + 1, n))) / lower[i, i]
+        return jnp.stack([whole[i] for i in range(n)])
+
+    return jax.lax.custom_linear_solve(product, force, substitute, symmetric=True)
