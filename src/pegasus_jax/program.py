@@ -20,7 +20,7 @@ from pegasus_jax.types import Experiment
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 
 # What runs for milliseconds need not be compiled well: with these a processor compiles it in half the time. In a fit or
-# a search, which run for seconds, the code they make is a tenth slower.
+# a search, which run for seconds, the code they make is up to a fifth slower.
 BRIEFLY = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
 LONG = ("fit", "search")
 
