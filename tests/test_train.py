@@ -188,6 +188,28 @@ def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:
     assert "at least 4" in fewer.stderr
 
 
+def test_a_run_goes_on_with_another_search(whole: Path, tmp_path: Path) -> None:
+    """Also with one whose optimiser remembers more; what was learned and written before stays as it is."""
+    run = copy_until(whole, tmp_path / "run", 9)
+    done = call("train", f"resume={run}", "trials=4", "search.steps=3", "search.best=true", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "not usable" not in done.stderr
+    rows = record.trials(run)
+    assert rows[:3] == record.trials(whole)
+    assert rows[3]["trial"] == 4
+    assert np.isfinite(rows[3]["objective_last"])
+    about = json.loads((run / "run.json").read_text())
+    assert [command["done"] for command in about["commands"]] == [0, 3]
+    assert "search.best=true" in about["commands"][1]["command"]
+    before = fingerprint(run)
+    again = call("train", f"resume={run}", cwd=tmp_path)  # the settings are the run's now
+    assert again.returncode == 0, again.stderr
+    assert fingerprint(run) == before
+    refused = call("train", f"resume={run}", "policy.hidden=[3]", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "policy.hidden cannot be changed" in refused.stderr
+
+
 def test_two_processes_cannot_write_to_one_run(whole: Path, tmp_path: Path) -> None:
     run = copy_until(whole, tmp_path / "run", 9)
     with record.lock(run):

@@ -13,7 +13,8 @@ from pegasus_jax.config import Config, SettingError
 
 TRAIN = """\
 pegasus-train task=NAME [setting=value ...]     learn a controller
-pegasus-train resume=RUN [trials=N]             go on with a run, also one that was killed
+pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that was killed; or with other fit.* or
+                                                search.* settings
 
   task=cartpole         what to learn: {tasks}
   model=log_normal      dynamics model: {models};
@@ -38,7 +39,7 @@ examples
   pegasus-train task=swimmer_corkscrew legs=6
   pegasus-train task=gym env=Pendulum-v1 cost=mymodule:cost horizon=40
   pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
-  pegasus-train resume=runs/demo trials=20
+  pegasus-train resume=runs/demo trials=20 search.refine=0.5
 
 Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, pegasus-play RUN, or
 tensorboard --logdir RUN/tensorboard.
@@ -134,8 +135,8 @@ def _train(words: Sequence[str]) -> None:
     options, rest = settings.split(words, OPTIONS)
     command = shlex.join(["pegasus-train", *words])
     if "resume" in options:
-        if wrong := sorted({*rest, *options} - {"resume", "trials", *OPTIONS[3:]}):
-            raise SettingError(f"{wrong[0]} cannot be changed by resume=; only trials= can")
+        if wrong := sorted(key for key in {*rest, *options} - {"resume", *OPTIONS[3:]} if not _changeable(key)):
+            raise SettingError(f"{wrong[0]} cannot be changed by resume=; only trials=, fit.* and search.* can")
         home = Path(options["resume"])
         runs = record.seeds_of(home)
         first = record.existing(next(iter(runs.values()), home))
@@ -169,6 +170,11 @@ def _train(words: Sequence[str]) -> None:
     train_seeds(config, runs, resume="resume" in options, command=command, mesh=over)
     if leads():
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
+
+
+def _changeable(key: str) -> bool:
+    """Whether a run can go on with another value of this setting: what it has learned stays what it is."""
+    return key == "trials" or key.startswith(("fit.", "search."))
 
 
 def _join(options: dict[str, str]) -> None:

@@ -187,6 +187,16 @@ def about(command: str) -> dict[str, Any]:
     }
 
 
+def note(run: Path, command: str, done: int) -> None:
+    """Write down what a run was made with, and every command that had a part in it: each came after `done` trials."""
+    path = run / "run.json"
+    try:
+        earlier = json.loads(path.read_text())["commands"]
+    except (OSError, ValueError, KeyError):  # a new run, or one of before they were kept
+        earlier = []
+    write_json(path, about(command) | {"commands": [*earlier, {"done": done, "command": command}]})
+
+
 def _readable(path: Path) -> Any:
     try:
         file = np.load(path)

@@ -22,7 +22,7 @@ from pegasus_jax.program import Program, fetched, leads
 from pegasus_jax.progress import Display
 from pegasus_jax.record import RunError
 from pegasus_jax.trial import COLLECT, EVALUATE, trial_key
-from pegasus_jax.types import Experiment, Key, Params, RunState, Task, Trajectory
+from pegasus_jax.types import Experiment, Key, Learner, Params, RunState, Task, Trajectory
 
 EPISODES = 20  # evaluation episodes a trial; never data
 
@@ -71,8 +71,11 @@ def train_seeds(
         done = display.done = 0 if states is None else int(states.trial[0])
         if done < config.trials:
             program.prepare("search")
+        keys = jnp.stack([jax.random.key(seed) for seed in seeds])
         if states is None:
-            states = program("init", jnp.stack([jax.random.key(seed) for seed in seeds]))
+            states = program("init", keys)
+        elif (config.fit, config.search) != (before.fit, before.search):
+            states = suited(states, program("init", keys))
         room = config.trials * experiment.task.horizon
         if room > states.data.x.shape[1]:
             states = states._replace(data=jax.vmap(partial(grow, capacity=room))(states.data))
@@ -80,7 +83,7 @@ def train_seeds(
         boards = []
         for seed, run in runs.items() if leads() else ():
             settings.save(replace(config, seed=seed), run / "config.yaml")
-            record.write_json(run / "run.json", record.about(command))
+            record.note(run, command, done)
             record.write_trials(run, record.trials(run)[:done])
             boards.append(held.enter_context(SummaryWriter(str(run / "tensorboard"), purge_step=done + 1)))
         with display.running():
@@ -243,6 +246,19 @@ def together(runs: Sequence[Path], config: Config, display: Display) -> RunState
         for problem in problems:
             display.line(f"checkpoint {trial} is not usable: {problem}; going on from the one before it")
     return None
+
+
+def suited(states: RunState, fresh: RunState) -> RunState:
+    """The states, with fresh optimisers where the settings ask for others than the run had so far."""
+
+    def shape(tree: Any) -> tuple[Any, list[Any]]:
+        return jax.tree.structure(tree), jax.tree.map(jnp.shape, jax.tree.leaves(tree))
+
+    def learner(old: Learner, new: Learner) -> Learner:
+        same = shape(old.optimizer) == shape(new.optimizer)
+        return old if same else old._replace(optimizer=new.optimizer)
+
+    return states._replace(model=learner(states.model, fresh.model), policy=learner(states.policy, fresh.policy))
 
 
 def newest(run: Path) -> tuple[Config, Experiment, RunState]:
