@@ -111,6 +111,30 @@ def test_a_refining_search_in_parts_is_the_whole():
     np.testing.assert_allclose(parts.policy.params, run(state)[0].policy.params, rtol=1e-6)
 
 
+def test_an_annealing_search_goes_on_where_that_of_the_trial_before_ended():
+    """Two searches of two iterations narrow as one of four; in a third the cost is the task's, the step size 0."""
+    course = dict(steps=2, learning_rate=1e-4, widen=2.0, decay=0.0, anneal=2, period=Period(0, 0, 0, 0, 0))
+    _, state, run = searcher(**course)
+    _, _, plain = searcher(**{**course, "widen": 1.0, "learning_rate": 1e-30, "anneal": 1})
+    moved = []
+    for trial, wider in ((1, True), (2, False), (3, False)):
+        now = state._replace(trial=jnp.int32(trial))
+        (after, info), (_, task) = run(now), plain(now)
+        if wider:
+            assert np.all(info.objective < 0.95 * task.objective)
+        else:
+            np.testing.assert_allclose(info.objective, task.objective, rtol=1e-2)
+        moved.append(np.abs(after.policy.params - now.policy.params).max())
+    # Adam's first two steps are as long as the step size, and that is half a cosine: (1 + cos(pi j / 4)) / 2 of 1e-4.
+    factors = (1 + np.cos(np.pi * np.arange(4) / 4)) / 2
+    np.testing.assert_allclose(moved, [1e-4 * factors[:2].sum(), 1e-4 * factors[2:].sum(), 0], rtol=0.05, atol=1e-9)
+
+
+def test_an_annealing_search_has_one_course():
+    with pytest.raises(SettingError, match=r"search.anneal=2 needs search.refine=0"):
+        config.Search(anneal=2, refine=0.5)
+
+
 def test_a_cost_without_a_width_cannot_be_widened():
     task = cart(horizon=2)._replace(widened=None)
     with pytest.raises(SettingError, match=r"search\.widen=4 needs a cost with a width.*the nearest is 1"):

@@ -245,6 +245,7 @@ def test_the_pace_falls_and_begins_again_where_a_search_refines():
     np.testing.assert_allclose([factor(i) for i in (0, 30, 59.99)], [1, 0.6, 0.2], atol=1e-3)
     np.testing.assert_allclose([factor(i) for i in (60, 80, 99.99)], [1, 0.515, 0.03], atol=1e-3)
     np.testing.assert_allclose([pace(100, 0.2)(i) for i in (0, 50, 99.99)], [1, 0.6, 0.2], atol=1e-3)
+    np.testing.assert_allclose([pace(100, 0.2)(i) for i in (100, 300)], 0.2, atol=1e-3)  # and stays
     assert pace(100, 1.0) is None
 
 
@@ -338,9 +339,7 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
 def seeking(optimizer, steps, value=jnp.nan, bad=(), last=12):
     """A keeping searcher around `pursue`."""
     init, run = optimizer.init, pursue(optimizer, steps, bad=bad, value=value)
-    searcher = Searcher(
-        init, lambda key, learner, belief, *, first, steps, begin: run(key, learner, belief, first=first)
-    )
+    searcher = Searcher(init, lambda key, learner, belief, *, first, steps: run(key, learner, belief, first=first))
     return keeping_best(searcher, last)
 
 

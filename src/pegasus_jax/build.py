@@ -46,6 +46,14 @@ from pegasus_jax.types import (
 )
 
 AGGREGATES = {"mean": cost.mean, "total": cost.total}
+NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
+    "log_normal": lambda config: dropout.log_normal(config.low, config.high),
+    "binary": lambda config: dropout.binary(config.rate),
+    "concrete": lambda config: dropout.concrete(config.rate),
+    "gaussian": lambda _: dropout.gaussian(),
+    "sparse": lambda _: dropout.sparse(),
+    "none": lambda _: dropout.none(),
+}
 EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 
 
@@ -81,6 +89,7 @@ def compose(
         search_steps=config.search.steps,
         search_reset=config.search.reset,
         search_restart=config.search.restart,
+        search_goes_on=config.search.anneal > 1,
         imagine=imagine,
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
@@ -138,7 +147,8 @@ def search_of(
     costs = costs_of(search, task)
     # The last part of a search is for refining: no matching, each particle's own cost, at its own width.
     refine = round((1 - search.refine) * search.steps) if search.refine else None
-    narrow = (search.steps if refine is None else refine) / 2 if search.widen > 1 else 0
+    steps = search.anneal * search.steps
+    narrow = (steps if refine is None else refine) / 2 if search.widen > 1 else 0
     width = narrowing(search.widen, narrow) if narrow else None
 
     def value(params: Params, belief: Params, given: Scenarios, iteration: Array) -> Array:
@@ -156,7 +166,7 @@ def search_of(
         period=Period(**vars(search.period)),
         course=Course(
             stage=jnp.asarray,
-            pace=pace(search.steps, search.decay, refine),
+            pace=pace(steps, search.decay, refine),
             settled=narrow if refine is None else refine,
             refine=refine,
         ),
@@ -299,7 +309,7 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
         case settings.SSGP():
             return ssgp(**shape, points=config.points)
         case settings.Lagrangian():
-            rates = rates_of(task)
+            rates = tasks.rates_of(task)
             member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
         case settings.BNN():
             member = bnn(
@@ -325,39 +335,12 @@ def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
     )
 
 
-def rates_of(task: Task) -> tuple[int, ...]:
-    """The entries of a task's state that are rates of the others. Raises SettingError where they are not known."""
-    states = len(task.state_names)
-    if 2 * len(set(task.rates)) != states or set(task.rates) & set(task.angles):
-        raise settings.SettingError(
-            f"model=lagrangian needs a state of coordinates and their rates, and that of task={task.name} is not known"
-            " to be one; the nearest is model=log_normal"
-        )
-    return task.rates
-
-
 def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
     """The configured noise on a model's units. Raises SettingError for parameters it cannot have."""
     try:
-        return _dropout_of(config)
+        return NOISES[config.dropout](config)
     except ValueError as error:
         raise settings.SettingError(f"model.dropout={config.dropout}: {error}") from error
-
-
-def _dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
-    match config.dropout:
-        case "log_normal":
-            return dropout.log_normal(config.low, config.high)
-        case "binary":
-            return dropout.binary(config.rate)
-        case "concrete":
-            return dropout.concrete(config.rate)
-        case "gaussian":
-            return dropout.gaussian()
-        case "sparse":
-            return dropout.sparse()
-        case _:
-            return dropout.none()
 
 
 def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task) -> Policy:
@@ -396,5 +379,6 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
                 dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
                 saturate=saturate,
                 initialiser=config.initialiser,
+                input_scale=tasks.input_scale(task, config.units),
                 output_scale=config.output_scale,
             )

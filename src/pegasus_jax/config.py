@@ -98,14 +98,12 @@ class _Network:
         _within("model.members", self.members, 1)
         object.__setattr__(self, "hidden", _layers("model.hidden", self.hidden))
         _choice("model.activation", self.activation, ACTIVATIONS)
-        _within("model.kl_weight", self.kl_weight, 0)
         _choice("model.dropout", self.dropout, DROPOUTS)
         _choice("model.head", self.head, HEADS)
         _choice("model.initialiser", self.initialiser, INITIALISERS)
         _within("model.rate", self.rate, 0, 0.99)
-        _within("model.weight_decay", self.weight_decay, 0)
-        _within("model.low", self.low, -math.inf)
-        _within("model.high", self.high, -math.inf)
+        for name, least in (("kl_weight", 0), ("weight_decay", 0), ("low", -math.inf), ("high", -math.inf)):
+            _within(f"model.{name}", getattr(self, name), least)
         if not self.low < self.high:
             raise SettingError(f"model.low={self.low:g} must be less than model.high={self.high:g}")
 
@@ -172,6 +170,7 @@ class MLP:
     dropout: float = setting(0.0, "drop probability of the hidden units; 0 is a deterministic policy")
     squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
     execution: str = setting("sampled", "on the plant: sampled (a fresh mask each step, explores), or mean")
+    units: tuple[float, ...] = setting((), "what it counts each state that is no angle in; []: the plant's own units")
     output_scale: float = setting(1.0, "factor of the last layer's initial weights")
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
@@ -182,7 +181,9 @@ class MLP:
         _choice("policy.execution", self.execution, EXECUTIONS)
         _choice("policy.initialiser", self.initialiser, INITIALISERS)
         _within("policy.dropout", self.dropout, 0, 0.99)
-        _within("policy.output_scale", self.output_scale, 0, open_low=True)
+        object.__setattr__(self, "units", tuple(self.units))
+        for name, value in (("output_scale", self.output_scale), *(("units", unit) for unit in self.units)):
+            _within(f"policy.{name}", value, 0, open_low=True)
 
 
 @dataclass(frozen=True)
@@ -278,6 +279,7 @@ class Search:
     cost: str = setting("matched", "expected one of the matched Gaussian, or of each of the particles: particles")
     refine: float = setting(0.0, "last part of a search: refines the better of what it found and the old policy")
     widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
+    anneal: int = setting(1, "so many trials' searches are one to widen and decay, which end then; 1: each is its own")
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
     limit: float | None = setting(None, "a particle's gradient by its state that is longer is dropped; null: none is")
@@ -292,8 +294,9 @@ class Search:
 
     def __post_init__(self) -> None:
         _kind("search", self.kind, "particles")
-        for name, least in (("steps", 1), ("particles", 2), ("widen", 1), ("starts", 1)):
-            _within(f"search.{name}", getattr(self, name), least)
+        least = dict(steps=1, particles=2, widen=1, anneal=1, starts=1, policy_noise=0, state_noise=0, cost_noise=0)
+        for name, value in least.items():
+            _within(f"search.{name}", getattr(self, name), value)
         _within("search.learning_rate", self.learning_rate, 0, open_low=True)
         _within("search.decay", self.decay, 0, 1)
         _choice("search.aggregate", self.aggregate, AGGREGATES)
@@ -308,10 +311,10 @@ class Search:
         for name, value in (("clip", self.clip), ("limit", self.limit)):
             if value is not None:
                 _within(f"search.{name}", value, 0, open_low=True)
+        if self.anneal > 1 and (self.refine or self.best or self.starts > 1):
+            raise SettingError(f"search.anneal={self.anneal} needs search.refine=0 search.best=false search.starts=1")
         if self.starts > 1 and not self.reset:
             raise SettingError(f"search.starts={self.starts} begins every search anew; it needs search.reset=true")
-        for name in ("policy_noise", "state_noise", "cost_noise"):
-            _within(f"search.{name}", getattr(self, name), 0)
 
 
 @dataclass(frozen=True)
@@ -327,7 +330,7 @@ class Analytic:
     policy_noise: float = setting(1.0, "factor of the model's noise on what the policy sees")
     state_noise: float = setting(1.0, "factor of the model's noise added to the state")
     cost_noise: float = setting(0.0, "factor of the model's noise on what the cost sees")
-    reset = True  # no setting: curvature is that of one model
+    reset, anneal = True, 1  # no settings: curvature is that of one model
 
     def __post_init__(self) -> None:
         _kind("search", self.kind, "analytic")

@@ -32,16 +32,16 @@ def narrowing(widest: float, over: float) -> Schedule:
 
 
 def pace(steps: int, decay: float, refine: int | None = None) -> Schedule | None:
-    """A factor of the step size: over a search it falls from 1 to `decay`, as half a cosine; None if it is always 1.
+    """A factor of the step size: in `steps` it falls from 1 to `decay`, as half a cosine; None if it is always 1.
 
     From the iteration `refine` on it falls from 1 once more, to .03.
     """
-    if refine is None and decay == 1:
-        return None
-    last = steps if refine is None else refine
-    fall = optax.cosine_decay_schedule(1.0, max(last, 1), decay)
-    again = optax.cosine_decay_schedule(1.0, max(steps - last, 1), 0.03)
-    return lambda i: jnp.where(i < last, fall(i), again(i - last))
+    if refine is None:
+        only = optax.cosine_decay_schedule(1.0, steps, decay)
+        return None if decay == 1 else lambda i: jnp.asarray(only(i))
+    fall = optax.cosine_decay_schedule(1.0, max(refine, 1), decay)
+    again = optax.cosine_decay_schedule(1.0, max(steps - refine, 1), 0.03)
+    return lambda i: jnp.where(i < refine, fall(i), again(i - refine))
 
 
 def either(condition: Array | None, yes: Callable[..., Array], no: Callable[..., Array]) -> Callable[..., Array]:

@@ -115,7 +115,14 @@ def analytic(
     """
 
     def run(
-        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, begin: Begin | None = None
+        key: Key,
+        learner: Learner,
+        belief: Params,
+        *,
+        first: Array | int,
+        steps: int,
+        begin: Begin | None = None,
+        **_: Any,
     ) -> tuple[Learner, SearchInfo]:
         std = noise_std(key, belief)
 

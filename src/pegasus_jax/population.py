@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pegasus_jax.types import Array, Begin, Key, Learner, Params, Searcher
+from pegasus_jax.types import Array, Key, Learner, Params, Searcher
 
 FRESH = 2**31 - 1  # what a search's key is folded with for fresh policies; for its scenarios these numbers are small
 
@@ -26,10 +26,8 @@ def best_of(searcher: Searcher, fresh: Callable[[Key], Params], *, starts: int, 
         return Learner(members, jax.vmap(searcher.init)(members))
 
     def run(
-        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, begin: Begin | None = None
+        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, **_: Any
     ) -> tuple[Learner, Any]:
-        del begin
-
         def gathered() -> Learner:
             others = jax.vmap(fresh)(jax.random.split(jax.random.fold_in(key, FRESH), starts - 1))
             members = jax.tree.map(lambda own, rest: jnp.concatenate([own[None], rest]), learner.params, others)

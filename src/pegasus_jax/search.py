@@ -106,6 +106,7 @@ def optimise(
     optimizer: optax.GradientTransformation,
     steps: int,
     first: Array | int = 0,
+    earlier: Array | int = 0,
     course: Course = Course(),
     begin: Begin | None = None,
 ) -> tuple[Learner, SearchInfo]:
@@ -113,6 +114,7 @@ def optimise(
 
     One call of n steps and two calls of n/2, the second with first=n/2, do the same. With a stage in the `course`, the
     objective takes one more argument, the stage of the iteration; a course that refines needs a `started` optimiser.
+    The course counts from `earlier`: the iterations of the searches before this one, where it goes on with theirs.
     """
     first = jnp.asarray(first, jnp.int32)
     optimizer = optax.with_extra_args_support(optimizer)
@@ -121,12 +123,12 @@ def optimise(
         learner, scenarios = carry
         if course.refine is not None:
             learner = jax.lax.cond(i == course.refine, better, lambda learner, *_: learner, learner, scenarios, i)
-        value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios, *course.at(i))
+        value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios, *course.at(earlier + i))
         # A wider cost is a lower one: its value says nothing about which parameters are best.
         known = jnp.where(i < course.settled, jnp.inf, value) if course.settled else value
         updates, state = optimizer.update(gradient, learner.optimizer, learner.params, value=known)
         if course.pace is not None:
-            updates = optax.tree.scale(course.pace(i), updates)
+            updates = optax.tree.scale(course.pace(earlier + i), updates)
         learner = Learner(optax.apply_updates(learner.params, updates), state)
         scenarios = redraw(key, i + 1, scenarios, belief)
         return (learner, scenarios), (value, optax.tree.norm(gradient))
@@ -141,7 +143,8 @@ def optimise(
     scenarios = draw(key, first, belief)
     given = learner.params
     if begin is not None:
-        learner = at_first(first, begin, learner, lambda params: objective(params, belief, scenarios, *course.at(0)))
+        stage = course.at(earlier)
+        learner = at_first(first, begin, learner, lambda params: objective(params, belief, scenarios, *stage))
     if course.refine is not None:
         kept = jax.tree.map(partial(jnp.where, first == 0), given, optax.tree.get(learner.optimizer, "start"))
         learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, start=kept))
@@ -186,12 +189,12 @@ def keeping_best(searcher: Searcher, last: int) -> Searcher:
     """
 
     def run(
-        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, begin: Begin | None = None
+        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, **more: Any
     ) -> tuple[Learner, Any]:
         known = optax.tree.get(learner.optimizer, "best_value")
         known = jnp.where(jnp.asarray(first) == 0, jnp.inf, known)  # what an older model thought does not count
         learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, best_value=known))
-        learner, info = searcher.run(key, learner, belief, first=first, steps=steps, begin=begin)
+        learner, info = searcher.run(key, learner, belief, first=first, steps=steps, **more)
         best = optax.tree.get(learner.optimizer, "best_params")
         kept = jax.tree.map(partial(jnp.where, first + steps >= last), best, learner.params)
         return learner._replace(params=kept), info

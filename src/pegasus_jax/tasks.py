@@ -119,6 +119,28 @@ def of_config(config: Config) -> Task:
     return own[config.task](config) if config.task in own else make(config.task, config.legs)
 
 
+def rates_of(task: Task) -> tuple[int, ...]:
+    """The entries of a task's state that are rates of the others. Raises SettingError where they are not known."""
+    states = len(task.state_names)
+    if 2 * len(set(task.rates)) != states or set(task.rates) & set(task.angles):
+        raise SettingError(
+            f"model=lagrangian needs a state of coordinates and their rates, and that of task={task.name} is not known"
+            " to be one; the nearest is model=log_normal"
+        )
+    return task.rates
+
+
+def input_scale(task: Task, units: tuple[float, ...]) -> Any:
+    """What a policy's features [F] are multiplied by, so that it counts in these units; 1 for none.
+
+    Raises SettingError where they are not one for each state that is no angle.
+    """
+    names = [name for i, name in enumerate(task.state_names) if i not in task.angles]
+    if units and len(units) != len(names):
+        raise SettingError(f"policy.units={list(units)} must be {len(names)} numbers, of {', '.join(names)}")
+    return np.concatenate([1 / np.array(units), np.ones(2 * len(task.angles))]) if units else 1.0
+
+
 def label(config: Config) -> str:
     """The task with what tells it from others of its name, as part of a folder's name."""
     if config.task.startswith("swimmer_"):

@@ -56,6 +56,7 @@ def experiment(
     search_steps: int,
     search_reset: bool,
     search_restart: bool,
+    search_goes_on: bool,
     imagine: Callable[[Key, Params, Params], tuple[Rollout, Array]],
     explore: Callable[[Key], Array],
     explore_trials: int,
@@ -120,7 +121,8 @@ def experiment(
                 params = restarted(params, policy.init(trial_key(state.key, state.trial, RESTART)), value)
             return Learner(params, search.init(params)) if search_reset else learner._replace(params=params)
 
-        learner, info = search.run(key, state.policy, belief, first=first, steps=steps, begin=begin)
+        earlier = search_steps * jnp.maximum(state.trial - max(1, explore_trials), 0) if search_goes_on else 0
+        learner, info = search.run(key, state.policy, belief, first=first, earlier=earlier, steps=steps, begin=begin)
         return state._replace(policy=learner), info
 
     def restarted(params: Params, fresh: Params, value: Callable[[Params], Array]) -> Params:

@@ -162,7 +162,8 @@ class Searcher(NamedTuple):
     """How a policy improves in imagination (Alg. 1 line 6)."""
 
     init: Callable[[Params], Any]  # parameters -> the optimiser's state
-    run: Callable[..., tuple[Learner, Any]]  # (key, learner, belief, first=, steps=, begin=) -> (learner, SearchInfo)
+    # (key, learner, belief, first=, earlier=, steps=, begin=) -> (learner, SearchInfo)
+    run: Callable[..., tuple[Learner, Any]]
 
 
 class RunState(NamedTuple):
