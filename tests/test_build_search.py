@@ -212,6 +212,8 @@ def test_each_factor_of_the_noise_reaches_its_place():
     told = imagined(policy_noise=0.5)
     np.testing.assert_allclose((told.u - plain.u)[1, :, 0], 0.5 * blur[0] @ np.array([-0.5, -0.8]), atol=1e-5)
     assert np.array_equal(told.x[1], plain.x[1])
+    known = imagined(policy_noise=1.0, sensors="known")  # .01 of the plant, and not the .2 that the model predicts
+    np.testing.assert_allclose((known.u - plain.u)[1, :, 0], blur[0] / 20 @ np.array([-0.5, -0.8]), atol=1e-6)
 
 
 def test_as_few_particles_as_are_allowed_do():

@@ -171,7 +171,7 @@ def STILL(noise, std):
 
 
 def test_the_default_is_the_authors_noise_on_the_policy_input_alone():
-    assert NoiseUse() == (1.0, 0.0, 0.0)
+    assert NoiseUse() == (1.0, 0.0, 0.0, None)
 
 
 @pytest.mark.parametrize("factor", range(3))

@@ -128,7 +128,8 @@ def search_of(
 ) -> tuple[Searcher, Imagine]:
     """The configured way of improving a policy, and fresh imagined rollouts of the same kind."""
     aggregate = AGGREGATES[search.aggregate]
-    noise = NoiseUse(search.policy_noise, search.state_noise, search.cost_noise)
+    known = jnp.asarray(task.sensor_std, float) if search.sensors == "known" else None
+    noise = NoiseUse(search.policy_noise, search.state_noise, search.cost_noise, known)
     if isinstance(search, settings.Analytic):
         return analytic_search_of(search, task, dynamics, policy, discounted(search, aggregate), noise)
     if (search.match or search.balanced) and search.particles <= len(task.state_names):

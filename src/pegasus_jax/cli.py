@@ -202,12 +202,10 @@ def _mesh(text: str | None, seeds: int) -> Any:
     """The mesh that mesh=SEEDSxPARTICLES asks for; by default as many devices as share the seeds evenly."""
     import math
 
-    import jax
-
-    from pegasus_jax.mesh import mesh
+    from pegasus_jax.mesh import evenly, mesh
 
     if text is None:
-        return mesh(math.gcd(seeds, jax.device_count()), 1)
+        return evenly(seeds)
     first, cross, second = text.partition("x")
     if not (cross and first.isdecimal() and second.isdecimal() and int(first) and int(second)):
         raise SettingError(f"mesh={text} is not of the form SEEDSxPARTICLES; for example mesh=4x1")

@@ -71,6 +71,7 @@ SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
 AGGREGATES = ("mean", "total")
 COSTS = ("particles", "matched")
+SENSORS = ("predicted", "known")
 EXECUTIONS = ("sampled", "mean")
 LEGS = (2, 6)
 PRECISIONS = ("single", "double")
@@ -97,10 +98,9 @@ class _Network:
         _kind("model", self.kind, type(self).kind)
         _within("model.members", self.members, 1)
         object.__setattr__(self, "hidden", _layers("model.hidden", self.hidden))
-        _choice("model.activation", self.activation, ACTIVATIONS)
-        _choice("model.dropout", self.dropout, DROPOUTS)
-        _choice("model.head", self.head, HEADS)
-        _choice("model.initialiser", self.initialiser, INITIALISERS)
+        kinds = dict(activation=ACTIVATIONS, dropout=DROPOUTS, head=HEADS, initialiser=INITIALISERS)
+        for name, choices in kinds.items():
+            _choice(f"model.{name}", getattr(self, name), choices)
         _within("model.rate", self.rate, 0, 0.99)
         for name, least in (("kl_weight", 0), ("weight_decay", 0), ("low", -math.inf), ("high", -math.inf)):
             _within(f"model.{name}", getattr(self, name), least)
@@ -177,9 +177,8 @@ class MLP:
     def __post_init__(self) -> None:
         _kind("policy", self.kind, "mlp")
         object.__setattr__(self, "hidden", _layers("policy.hidden", self.hidden))
-        _choice("policy.squash", self.squash, SQUASHES)
-        _choice("policy.execution", self.execution, EXECUTIONS)
-        _choice("policy.initialiser", self.initialiser, INITIALISERS)
+        for name, choices in (("squash", SQUASHES), ("execution", EXECUTIONS), ("initialiser", INITIALISERS)):
+            _choice(f"policy.{name}", getattr(self, name), choices)
         _within("policy.dropout", self.dropout, 0, 0.99)
         object.__setattr__(self, "units", tuple(self.units))
         for name, value in (("output_scale", self.output_scale), *(("units", unit) for unit in self.units)):
@@ -287,7 +286,8 @@ class Search:
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
     starts: int = setting(1, "policies searched side by side, the old one and fresh ones, of which the best goes on")
-    policy_noise: float = setting(1.0, "factor of the predicted noise on what the policy sees")
+    sensors: str = setting("predicted", "noise on what the policy sees: as the model predicts, or the plant's: known")
+    policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
     cost_noise: float = setting(0.0, "factor of the predicted noise on what the cost sees")
     period: Period = Period()
@@ -299,9 +299,9 @@ class Search:
             _within(f"search.{name}", getattr(self, name), value)
         _within("search.learning_rate", self.learning_rate, 0, open_low=True)
         _within("search.decay", self.decay, 0, 1)
-        _choice("search.aggregate", self.aggregate, AGGREGATES)
+        for name, choices in (("aggregate", AGGREGATES), ("cost", COSTS), ("sensors", SENSORS)):
+            _choice(f"search.{name}", getattr(self, name), choices)
         _within("search.discount", self.discount, 0, 1, open_low=True)
-        _choice("search.cost", self.cost, COSTS)
         _within("search.risk", self.risk, 0, 1, open_low=True)
         if self.risk < 1 and self.cost == "matched":
             raise SettingError(f"search.risk={self.risk:g} needs the cost of each particle: search.cost=particles")
@@ -330,7 +330,7 @@ class Analytic:
     policy_noise: float = setting(1.0, "factor of the model's noise on what the policy sees")
     state_noise: float = setting(1.0, "factor of the model's noise added to the state")
     cost_noise: float = setting(0.0, "factor of the model's noise on what the cost sees")
-    reset, anneal = True, 1  # no settings: curvature is that of one model
+    reset, anneal, sensors = True, 1, "predicted"  # no settings: curvature is that of one model
 
     def __post_init__(self) -> None:
         _kind("search", self.kind, "analytic")

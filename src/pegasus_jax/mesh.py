@@ -5,6 +5,7 @@ communicates: the same program runs on one device, on several, and on those of s
 for the `particles` axis are the sums over particles: moments to be matched, the objective and its gradient.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -25,6 +26,11 @@ def mesh(seeds: int, particles: int) -> Mesh | None:
         return None
     devices = jax.devices()[:wanted]
     return jax.make_mesh((seeds, particles), (SEEDS, PARTICLES), axis_types=(AxisType.Auto,) * 2, devices=devices)
+
+
+def evenly(seeds: int) -> Mesh | None:
+    """As many devices as share the seeds evenly; None for one."""
+    return mesh(math.gcd(seeds, jax.device_count()), 1)
 
 
 def together(tree: Any, axis: int) -> Any:

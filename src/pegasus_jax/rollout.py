@@ -1,7 +1,7 @@
 """K imagined trajectories as a deterministic function of policy, belief and scenarios. No keys here."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,11 +10,12 @@ from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenario
 
 
 class NoiseUse(NamedTuple):
-    """Where the model's predicted observation noise enters a rollout, as factors of it (docs/reference.md 5.4)."""
+    """Where observation noise enters a rollout, as factors of the model's predicted std (docs/reference.md 5.4)."""
 
     policy: float = 1.0  # the policy sees x_t + factor * std_t * noise_t
     state: float = 0.0  # the state itself moves by factor * std * noise
     cost: float = 0.0  # the cost sees x_t + factor * std_t * noise_t
+    sensors: Any = None  # [D] the std of what the policy sees, where it is known; None: as predicted
 
 
 def rollout(
@@ -40,18 +41,19 @@ def rollout(
     predict = jax.vmap(dynamics.apply, (None, 0, 0, 0))
 
     def step(carry: tuple[Array, Array], draws: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple]:
-        x, blur = carry
+        x, seeing = carry
         t, sensor, redraw = draws
         if truncate is not None:
             x = jnp.where(t % truncate == 0, jax.lax.stop_gradient(x), x)
         if limit is not None:
             x = limited(x, limit)
-        u = act(policy_params, scenarios.policy, x + noise.policy * blur)
+        u = act(policy_params, scenarios.policy, x + noise.policy * seeing)
         change = predict(belief, scenarios.dynamics, x, u)
         std = jax.lax.stop_gradient(change.std)
         blur = std * sensor
         after = match(x + change.mean + noise.state * blur, redraw)
-        return (after, blur), (after, u, std, after + noise.cost * blur)
+        seeing = blur if noise.sensors is None else noise.sensors * sensor
+        return (after, seeing), (after, u, std, after + noise.cost * blur)
 
     start = scenarios.start
     times = jnp.arange(scenarios.match.shape[0])

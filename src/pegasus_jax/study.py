@@ -1,7 +1,6 @@
 """Learning studies: every seed of a configuration in one vmapped program, every curve kept raw."""
 
 import json
-import math
 import sys
 import time
 from functools import partial
@@ -39,7 +38,7 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
         )
     set_precision(config)
     experiment = build(config)
-    over = mesh.mesh(math.gcd(len(seeds), jax.device_count()), 1)
+    over = mesh.evenly(len(seeds))
     each = partial(jax.vmap, spmd_axis_name=mesh.SEEDS)
     # What lies where: a seed's own on the devices for seeds, the number of the trial on all.
     own, all_the_same = (None, None) if over is None else (mesh.over_seeds(over), mesh.shared(over))
