@@ -92,14 +92,16 @@ def test_the_rates_of_a_gym_are_named_and_checked():
 def test_a_policy_counts_in_the_units_it_is_given():
     """Speeds in units of 2 m/s: the control is that of the plain policy at half the speed; angles have none."""
     task = tasks.make("cartpole")
-    plain, counting = (policy_of(config.MLP(hidden=(5,), units=units), task) for units in ((), (1.0, 2.0, 4.0)))
+    plain, counting = (policy_of(config.MLP(hidden=(5,), input_units=units), task) for units in ((), (1.0, 2.0, 4.0)))
     params = plain.init(jax.random.key(0))
     at = lambda policy, x: policy.apply(params, None, jnp.array(x))  # noqa: E731
     np.testing.assert_allclose(at(counting, [0.3, 1, -2, 2.5]), at(plain, [0.3, 0.5, -0.5, 2.5]), rtol=1e-5)
-    with pytest.raises(SettingError, match=r"policy.units=\[1.0\] must be 3 numbers, of x \[m\], x' \[m/s\], theta'"):
-        policy_of(config.MLP(units=(1.0,)), task)
-    with pytest.raises(SettingError, match=r"policy.units=0 is out of range"):
-        config.MLP(units=(1.0, 0.0, 1.0))
+    with pytest.raises(
+        SettingError, match=r"policy.input_units=\[1.0\] must be 3 numbers, of x \[m\], x' \[m/s\], theta'"
+    ):
+        policy_of(config.MLP(input_units=(1.0,)), task)
+    with pytest.raises(SettingError, match=r"policy.input_units=0 is out of range"):
+        config.MLP(input_units=(1.0, 0.0, 1.0))
 
 
 @pytest.mark.parametrize(

@@ -216,6 +216,12 @@ def test_each_factor_of_the_noise_reaches_its_place():
     np.testing.assert_allclose((known.u - plain.u)[1, :, 0], blur[0] / 20 @ np.array([-0.5, -0.8]), atol=1e-6)
 
 
+def test_sensors_that_are_not_known_cannot_be_expected():
+    task = cart()._replace(sensor_std=np.zeros(2))
+    with pytest.raises(SettingError, match=r"search.sensors=known needs .* task=cart is not; the nearest is"):
+        compose(dataclasses.replace(tiny(), search=config.Search(sensors="known")), task)
+
+
 def test_as_few_particles_as_are_allowed_do():
     assert np.isfinite(first_objective(particles=3, balanced=True))
 

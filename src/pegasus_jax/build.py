@@ -128,7 +128,7 @@ def search_of(
 ) -> tuple[Searcher, Imagine]:
     """The configured way of improving a policy, and fresh imagined rollouts of the same kind."""
     aggregate = AGGREGATES[search.aggregate]
-    known = jnp.asarray(task.sensor_std, float) if search.sensors == "known" else None
+    known = tasks.known_sensors(task) if search.sensors == "known" else None
     noise = NoiseUse(search.policy_noise, search.state_noise, search.cost_noise, known)
     if isinstance(search, settings.Analytic):
         return analytic_search_of(search, task, dynamics, policy, discounted(search, aggregate), noise)
@@ -380,6 +380,6 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
                 dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
                 saturate=saturate,
                 initialiser=config.initialiser,
-                input_scale=tasks.input_scale(task, config.units),
+                input_scale=tasks.input_scale(task, config.input_units),
                 output_scale=config.output_scale,
             )

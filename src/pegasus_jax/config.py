@@ -170,7 +170,7 @@ class MLP:
     dropout: float = setting(0.0, "drop probability of the hidden units; 0 is a deterministic policy")
     squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
     execution: str = setting("sampled", "on the plant: sampled (a fresh mask each step, explores), or mean")
-    units: tuple[float, ...] = setting((), "what it counts each state that is no angle in; []: the plant's own units")
+    input_units: tuple[float, ...] = setting((), "what it counts each state that is no angle in; []: the plant's units")
     output_scale: float = setting(1.0, "factor of the last layer's initial weights")
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
@@ -180,8 +180,8 @@ class MLP:
         for name, choices in (("squash", SQUASHES), ("execution", EXECUTIONS), ("initialiser", INITIALISERS)):
             _choice(f"policy.{name}", getattr(self, name), choices)
         _within("policy.dropout", self.dropout, 0, 0.99)
-        object.__setattr__(self, "units", tuple(self.units))
-        for name, value in (("output_scale", self.output_scale), *(("units", unit) for unit in self.units)):
+        object.__setattr__(self, "input_units", tuple(self.input_units))
+        for name, value in (("output_scale", self.output_scale), *(("input_units", unit) for unit in self.input_units)):
             _within(f"policy.{name}", value, 0, open_low=True)
 
 

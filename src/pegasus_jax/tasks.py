@@ -130,6 +130,16 @@ def rates_of(task: Task) -> tuple[int, ...]:
     return task.rates
 
 
+def known_sensors(task: Task) -> np.ndarray:
+    """The std [D] of a task's sensors. Raises SettingError where it is not known."""
+    if not np.any(task.sensor_std):
+        raise SettingError(
+            f"search.sensors=known needs a plant whose sensors' noise is known, and that of task={task.name} is not;"
+            " the nearest is search.sensors=predicted"
+        )
+    return np.asarray(task.sensor_std, float)
+
+
 def input_scale(task: Task, units: tuple[float, ...]) -> Any:
     """What a policy's features [F] are multiplied by, so that it counts in these units; 1 for none.
 
@@ -137,7 +147,7 @@ def input_scale(task: Task, units: tuple[float, ...]) -> Any:
     """
     names = [name for i, name in enumerate(task.state_names) if i not in task.angles]
     if units and len(units) != len(names):
-        raise SettingError(f"policy.units={list(units)} must be {len(names)} numbers, of {', '.join(names)}")
+        raise SettingError(f"policy.input_units={list(units)} must be {len(names)} numbers, of {', '.join(names)}")
     return np.concatenate([1 / np.array(units), np.ones(2 * len(task.angles))]) if units else 1.0
 
 
