@@ -237,6 +237,7 @@ def test_eval_and_plot_work_while_a_run_goes_on(whole: Path, tmp_path: Path) -> 
         ("train", ["task=cartpole", "search.particles=4"], "at least 5"),
         ("train", ["task=cartpole", "out=/proc/nowhere"], "out=/proc/nowhere cannot be written"),
         ("train", ["resume=nowhere"], "nowhere is not a run"),
+        ("train", ["resume=nowhere", "seed=3"], "seed cannot be changed"),
         ("train", ["resume=nowhere", "policy.hidden=[3]"], "policy.hidden cannot be changed"),
         ("evaluate", ["nowhere"], "nowhere is not a run"),
         ("evaluate", ["nowhere", "episode=3"], "did you mean 'episodes'"),
