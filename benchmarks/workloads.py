@@ -23,7 +23,7 @@ from pegasus_jax.types import Array, Experiment, Params, Period, RunState, Scena
 
 SIZES = {
     "cart-pole": {"task": "cartpole", "model": "log_normal", "policy": "dropout_mlp", "search.particles": "100"},
-    "double cart-pole": {"task": "double_cartpole", "search.particles": "100"},
+    "double cart-pole": {"task": "double_cartpole", "model": "log_normal", "search.particles": "100"},
     "swimmer, 6 legs": {"task": "swimmer_depth_change", "legs": "6", "search.particles": "100"},
     "cart-pole, K=1000": {
         "task": "cartpole",

@@ -31,7 +31,7 @@ def descent():
     """Plain gradient descent, as a searcher without scenarios."""
     optimizer = optax.sgd(0.02, momentum=0.5)
 
-    def run(key, learner, belief, *, first, steps, begin=None):
+    def run(key, learner, belief, *, first, steps, earlier=0, begin=None):
         def step(learner, _):
             value, gradient = jax.value_and_grad(wells)(learner.params, belief)
             updates, state = optimizer.update(gradient, learner.optimizer)
@@ -87,6 +87,25 @@ def test_every_search_has_fresh_policies_of_its_own():
     assert np.array_equal(members[0], members[1])
     assert members[0][0] == members[2][0]  # the policy itself
     assert not np.any(members[0][1:] == members[2][1:])
+
+
+def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_each():
+    fresh = lambda key: jax.random.uniform(key, minval=-2.0, maxval=2.0)  # noqa: E731
+
+    def members(lasting):
+        """After a search of 3 iterations, and after one more, with another key."""
+        searcher = best_of(descent(), fresh, starts=STARTS, last=3, lasting=lasting)
+        learner = Learner(jnp.float32(0.3), searcher.init(jnp.float32(0.3)))
+        first, _ = searcher.run(jax.random.key(0), learner, DEEPER, first=0, earlier=0, steps=3)
+        second, _ = searcher.run(jax.random.key(1), first, DEEPER, first=0, earlier=3, steps=3)
+        return first, second
+
+    begun = jax.vmap(lambda own: descent().run(None, Learner(own, descent().init(own)), DEEPER, first=0, steps=3)[0])
+    first, second = members(lasting=True)
+    np.testing.assert_allclose(second.optimizer.params, begun(first.optimizer.params).params, rtol=1e-6)
+    first, second = members(lasting=False)
+    np.testing.assert_allclose(second.optimizer.params[0], begun(first.params[None]).params[0], rtol=1e-6)
+    assert not np.any(np.isclose(second.optimizer.params[1:], begun(first.optimizer.params).params[1:], rtol=1e-3))
 
 
 def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():

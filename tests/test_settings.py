@@ -95,8 +95,19 @@ def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorith
     assert own.model == Lagrangian(substeps=1)
     assert own == settings.parse({"task": "cartpole", "model": "lagrangian", "algorithm": "pegasus"})
     assert settings.parse({"task": "cartpole", "model": "log_normal"}).model == BNN()
-    for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}, {"task": "double_cartpole"}):
-        assert settings.parse(words).model == settings.parse({"model": "log_normal", **words}).model
+    for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}, {"task": "swimmer_corkscrew"}):
+        assert settings.parse(words) == settings.parse({"model": "log_normal", **words})
+
+
+def test_what_suits_a_task_best_is_the_least_of_what_is_said():
+    """Where a model is named the settings chosen with another do not count; a named policy's own do, and words do."""
+    own, named = (settings.parse({"task": "double_cartpole"} | model) for model in ({}, {"model": "lagrangian"}))
+    assert (own.model.substeps, own.search.anneal, own.search.sensors, own.explore.trials) == (4, 14, "known", 4)
+    assert (own.model.hidden, own.policy.hidden, own.policy.dropout) == ((32, 32), (50,) * 4, 0)
+    assert (named.model.substeps, named.search.anneal, named.explore.trials) == (2, 1, 2)
+    changed = settings.parse({"task": "double_cartpole", "policy": "dropout_mlp", "search.anneal": "3"})
+    assert (changed.policy.dropout, changed.search.anneal, changed.model) == (0.1, 3, own.model)
+    assert settings.parse({"task": "double_cartpole", "policy": "rbf"}).policy == RBF()
 
 
 def test_every_setting_has_a_spelling():

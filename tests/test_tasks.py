@@ -54,7 +54,7 @@ def test_a_task_builds(name: str, legs: int, states: int, controls: int, horizon
 
 def test_tasks_bring_their_defaults() -> None:
     """docs/reference.md 2.2 and 3.4; a setting on the line wins over them."""
-    double = parse("task=double_cartpole")
+    double = parse("task=double_cartpole", "model=log_normal")
     assert (double.model.hidden, double.policy.hidden) == ((200,) * 4, (50,) * 4)
     assert (double.search.learning_rate, double.explore.trials, double.trials) == (1e-4, 2, 40)
     two, six = parse("task=swimmer_belly_up"), parse("task=swimmer_belly_up", "legs=6", "trials=8")

@@ -175,7 +175,8 @@ def search_of(
     if search.best:
         searcher = keeping_best(searcher, search.steps)
     if search.starts > 1:
-        searcher = best_of(searcher, policy.init, starts=search.starts, last=search.steps)
+        lasting = search.anneal > 1  # one course for all searches: who began late would be behind
+        searcher = best_of(searcher, policy.init, starts=search.starts, last=search.steps, lasting=lasting)
     return searcher, partial(imagined, **pieces, match=match, blocks=blocks, cost=task.cost)
 
 

@@ -285,7 +285,7 @@ class Search:
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
-    starts: int = setting(1, "policies searched side by side, the old one and fresh ones, of which the best goes on")
+    starts: int = setting(1, "policies searched side by side, the best of which goes on: the old one and fresh ones")
     sensors: str = setting("predicted", "noise on what the policy sees: as the model predicts, or the plant's: known")
     policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
@@ -311,8 +311,8 @@ class Search:
         for name, value in (("clip", self.clip), ("limit", self.limit)):
             if value is not None:
                 _within(f"search.{name}", value, 0, open_low=True)
-        if self.anneal > 1 and (self.refine or self.best or self.starts > 1):
-            raise SettingError(f"search.anneal={self.anneal} needs search.refine=0 search.best=false search.starts=1")
+        if self.anneal > 1 and (self.refine or self.best):
+            raise SettingError(f"search.anneal={self.anneal} needs search.refine=0 search.best=false")
         if self.starts > 1 and not self.reset:
             raise SettingError(f"search.starts={self.starts} begins every search anew; it needs search.reset=true")
 

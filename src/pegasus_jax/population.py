@@ -1,4 +1,4 @@
-"""Several policies searched side by side in each trial: the old one and fresh ones. The best goes on."""
+"""Several policies searched side by side. The best goes on: to the plant, and where they do not last, alone."""
 
 from collections.abc import Callable
 from typing import Any
@@ -11,13 +11,16 @@ from pegasus_jax.types import Array, Key, Learner, Params, Searcher
 FRESH = 2**31 - 1  # what a search's key is folded with for fresh policies; for its scenarios these numbers are small
 
 
-def best_of(searcher: Searcher, fresh: Callable[[Key], Params], *, starts: int, last: int) -> Searcher:
+def best_of(
+    searcher: Searcher, fresh: Callable[[Key], Params], *, starts: int, last: int, lasting: bool = False
+) -> Searcher:
     """The searcher that searches from `starts` policies under the same scenarios, all of them until the trial ends.
 
-    The first is the policy it is given, the others are `fresh` at iteration 0 of each trial; all begin with a new
-    optimiser, so `begin` is not asked. The learner's parameters are always those of the member with the lowest mean
-    objective over the last twentieth of a search of `last` iterations, or as many as there were. Its optimiser is all
-    members: a `Learner` [starts, ...].
+    The first is the policy it is given, the others are `fresh` at iteration 0 of each trial; or of the first search
+    where they are `lasting`, and then each goes on from trial to trial, whichever is the best. All begin a trial with a
+    new optimiser, so `begin` is not asked. The learner's parameters are always those of the member with the lowest
+    mean objective over the last twentieth of a search of `last` iterations, or as many as there were. Its optimiser is
+    all members: a `Learner` [starts, ...].
     """
     window = max(1, last // 20)
 
@@ -26,15 +29,22 @@ def best_of(searcher: Searcher, fresh: Callable[[Key], Params], *, starts: int, 
         return Learner(members, jax.vmap(searcher.init)(members))
 
     def run(
-        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, **_: Any
+        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, begin: Any = None, **more: Any
     ) -> tuple[Learner, Any]:
-        def gathered() -> Learner:
+        del begin
+
+        def gathered() -> Params:
             others = jax.vmap(fresh)(jax.random.split(jax.random.fold_in(key, FRESH), starts - 1))
-            members = jax.tree.map(lambda own, rest: jnp.concatenate([own[None], rest]), learner.params, others)
+            return jax.tree.map(lambda own, rest: jnp.concatenate([own[None], rest]), learner.params, others)
+
+        def begun() -> Learner:
+            old = learner.optimizer.params
+            copies = jnp.all(jnp.stack([jnp.all(leaf == leaf[0]) for leaf in jax.tree.leaves(old)]))  # as `init` has it
+            members = jax.lax.cond(copies, gathered, lambda: old) if lasting else gathered()
             return Learner(members, jax.vmap(searcher.init)(members))
 
-        members = jax.lax.cond(jnp.asarray(first) == 0, gathered, lambda: learner.optimizer)
-        search = lambda member: searcher.run(key, member, belief, first=first, steps=steps)  # noqa: E731
+        members = jax.lax.cond(jnp.asarray(first) == 0, begun, lambda: learner.optimizer)
+        search = lambda member: searcher.run(key, member, belief, first=first, steps=steps, **more)  # noqa: E731
         members, info = jax.vmap(search)(members)
         values = jnp.mean(info.objective[:, -window:], 1)
         best = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values))

@@ -38,10 +38,12 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
         if value not in VARIANTS[name]:
             raise SettingError(f"{name}={value} is unknown; {nearest(value, VARIANTS[name])}")
     task, algorithm = chosen.get("task", Config.task), chosen.get("algorithm", "pegasus")
-    # A task's best model goes with the best algorithm; the others are of the paper, and so is their model.
-    best = tasks.BEST_MODELS.get(task, "log_normal") if algorithm == "pegasus" else "log_normal"
+    # What suits a task best goes with the best algorithm and where no model is named; the rest is the paper's.
+    own = algorithm == "pegasus" and "model" not in chosen
+    best, changes = tasks.BEST.get(task, ("log_normal", {})) if own else (chosen.get("model", "log_normal"), {})
     variants: dict[str, Any] = {
-        **MODELS[chosen.get("model", best)],
+        **MODELS[best],
+        **changes,
         **ALGORITHMS[algorithm],
         **(POLICIES[chosen["policy"]] if "policy" in chosen else {}),
     }

@@ -90,8 +90,31 @@ _LEGS: dict[int, dict[str, Any]] = {
 }
 
 
-# The model of a task where it is not the default one: docs/decisions/0006.
-BEST_MODELS = {"cartpole": "lagrangian"}
+# The model with which a task is learned best, where it is not the default one, and what is changed with it:
+# docs/decisions/0006, 0008 and 0009.
+BEST: dict[str, tuple[str, dict[str, Any]]] = {
+    "cartpole": ("lagrangian", {}),
+    "double_cartpole": (
+        "lagrangian",
+        {
+            "model.substeps": 4,
+            "policy.dropout": 0.0,
+            "policy.input_units": (1.0, 3.0, 6.0, 8.0),
+            "fit.steps": 5000,
+            "fit.decay": 0.03,
+            "search.steps": 600,
+            "search.learning_rate": 3e-3,
+            "search.decay": 0.03,
+            "search.match": False,
+            "search.cost": "particles",
+            "search.anneal": 14,
+            "search.limit": 1.0,
+            "search.sensors": "known",
+            "explore.trials": 4,
+            "explore.kind": "walk",
+        },
+    ),
+}
 
 
 def defaults(name: str, legs: int = 2) -> dict[str, Any]:
