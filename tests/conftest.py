@@ -5,6 +5,8 @@ import os
 # Before jax loads LAPACK: two test processes on two cores, each with a thread a core that spins while it waits, made a
 # Cholesky factor of 375 rows take a second instead of a millisecond.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Compile faster to slower code, here and in the processes that tests start: their programs are many and tiny.
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 
 import jax
 import pytest
@@ -33,11 +35,3 @@ def x64():
     """Float64 inside one test, for closed forms and finite differences."""
     with jax.enable_x64(True):
         yield
-
-
-@pytest.fixture(scope="module")
-def quick_compile():
-    """Compile faster to slower code: for modules whose programs are many and tiny."""
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", False)

@@ -16,8 +16,6 @@ from pegasus_jax.noisy import HEADS
 from pegasus_jax.types import Batch, Dataset, Learner
 from probes import experience, network
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 BATCH = Batch(*(rows[:6] for rows in experience()[:3]))
 
 

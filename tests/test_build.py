@@ -30,8 +30,6 @@ from pegasus_jax.types import Learner
 from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
 from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, same, tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 def test_the_choices_of_a_config_are_the_pieces_there_are():
     """config.py cannot import the pieces; it lists their names, and this keeps the lists true."""

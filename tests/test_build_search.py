@@ -23,8 +23,6 @@ from pegasus_jax.trial import SEARCH, trial_key
 from pegasus_jax.types import Dataset, Learner
 from probes import PENDULUM, cart, known, linear_policy, tiny
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 def eagerly(function):
     """Operation by operation: for one step of a tiny search, nine times faster than compiling it."""

@@ -16,8 +16,6 @@ from pegasus_jax import cost, tasks
 from pegasus_jax.angles import encode
 from pegasus_jax.gaussian import sincos
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 COSTS = np.random.default_rng(0).uniform(size=(6, 4)).astype(np.float32)  # [H, K]
 number = st.floats(-5, 5, width=32)
 

@@ -10,8 +10,6 @@ import pytest
 from pegasus_jax import episode
 from probes import cart
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 TASK = cart(horizon=6)
 LOW, HIGH = jnp.array([-2.0, 1.0]), jnp.array([2.0, 1.5])
 

@@ -16,8 +16,6 @@ from pegasus_jax.types import Trajectory
 from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
 from probes import Counter, same, unchecked
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 HORIZON, SEEDS = 3, 2
 WIDTH = 3.0  # [m], of the cost: it is flat nowhere that a model can imagine here
 UPRIGHT = np.array([0, 0, 0, np.pi])

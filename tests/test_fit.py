@@ -12,8 +12,6 @@ from pegasus_jax.fit import fit, guarded
 from pegasus_jax.types import Dataset, Learner
 from probes import same
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 N, SIZE = 30, 12
 NOISE = np.random.default_rng(0)
 X = NOISE.normal(size=(SIZE, 2))

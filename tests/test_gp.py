@@ -16,8 +16,6 @@ from pegasus_jax.lbfgs import full_data
 from pegasus_jax.types import Dataset, Learner
 from probes import experience, same
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 SHAPES = dict(states=3, controls=2, angles=(2,))
 MODELS = {"gp": partial(gp, features=20), "ssgp": partial(ssgp, points=20)}
 both = pytest.mark.parametrize("kind", MODELS)

@@ -10,8 +10,6 @@ from pegasus_jax.lbfgs import full_data, minimise
 from pegasus_jax.types import Dataset, Learner
 from probes import regression, same
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 
 def rosenbrock(x):
     return jnp.sum(100 * (x[1:] - x[:-1] ** 2) ** 2 + (1 - x[:-1]) ** 2)

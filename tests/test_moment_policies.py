@@ -15,8 +15,6 @@ from pegasus_jax.policy.rbf import NOISE, rbf
 from pegasus_jax.policy.squash import SQUASHES, to_limits
 from probes import LIMITS, dial
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 F, UNITS = 4, 6
 MEAN = np.array([0.3, -0.2, 0.9, -0.4])
 COV = 0.2 * np.cov(np.random.default_rng(0).normal(size=(F, 9)))

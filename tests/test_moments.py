@@ -9,8 +9,6 @@ from hypothesis import strategies as st
 
 from pegasus_jax.moments import cholesky, keep, match, mean_and_cov, standardise
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 seeds = st.integers(0, 2**16)
 sizes = pytest.mark.parametrize("size", [1, 4, 7])
 

@@ -15,18 +15,19 @@ from test_train import call
 
 TINY = ["task=cartpole", "model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "trials=1"]
 TINY += ["search.particles=8"]
+OPTIMISED = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}  # twenty episodes take longer than compiling them
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "run"
-    done = call("train", *TINY, f"out={folder}", cwd=folder.parent)
+    done = call("train", *TINY, f"out={folder}", cwd=folder.parent, **OPTIMISED)
     assert done.returncode == 0, done.stderr
     return folder
 
 
 def test_a_film_of_a_tiny_run(run: Path) -> None:
-    done = call("play", run, "seed=3", cwd=run.parent)
+    done = call("play", run, "seed=3", cwd=run.parent, **OPTIMISED)
     assert (done.returncode, done.stderr) == (0, "")
     assert done.stdout.split() == [str(run / "play.mp4")]
     assert not list(run.glob(".play*"))

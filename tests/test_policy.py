@@ -12,8 +12,6 @@ from pegasus_jax import dropout
 from pegasus_jax.policy.squash import SQUASHES, sine, to_limits
 from probes import LIMITS, controller
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 every_squash = pytest.mark.parametrize("squash", SQUASHES)
 single = st.floats(-1e6, 1e6, width=32)
 

@@ -17,8 +17,6 @@ from pegasus_jax.search import SearchInfo
 from pegasus_jax.types import Learner, Searcher
 from probes import cart, noisy_linear_policy, regression, same, tiny, unchecked
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 STARTS, STEPS, DEEPER = 4, 60, 0.1
 
 

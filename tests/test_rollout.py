@@ -15,8 +15,6 @@ from pegasus_jax.scenarios import draw
 from pegasus_jax.types import Dynamics, Period, Policy, Prediction, Scenarios
 from probes import PENDULUM, Linear, known, linear_policy, rig
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 K, H, D = 7, 4, 3
 MATCHES = {"match": moments.match, "keep": moments.keep}
 NOISE = NoiseUse(policy=0.7, state=0.4, cost=0.5)

@@ -14,8 +14,6 @@ from pegasus_jax.moments import standardise
 from pegasus_jax.types import Period, Scenarios
 from probes import rig, same
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 STEPS = 7
 # The same sampler for every block: two blocks with one key would show as equal draws.
 PLAIN = scenarios.Blocks(*[lambda key, belief: belief * jax.random.bits(key, (2,))] * 5)

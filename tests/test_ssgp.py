@@ -3,15 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from scipy import stats
 
 from pegasus_jax import kernel
 from pegasus_jax.dynamics import gp as exact
 from pegasus_jax.dynamics.ssgp import log_evidence, ssgp
 from probes import experience
-
-pytestmark = pytest.mark.usefixtures("quick_compile")
 
 SHAPES = dict(states=3, controls=2, angles=(2,))
 

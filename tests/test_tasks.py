@@ -80,7 +80,9 @@ def test_an_unknown_task_is_named() -> None:
         tasks.make("double_cartpol")
 
 
-@pytest.mark.parametrize("words", [["task=double_cartpole"], ["task=swimmer_knife_edge", "legs=2"]], ids=" ".join)
+@pytest.mark.parametrize(
+    "words", [["task=double_cartpole", "model.substeps=1"], ["task=swimmer_knife_edge", "legs=2"]], ids=" ".join
+)
 def test_a_tiny_trial_through_the_command_line(words: list[str], tmp_path: Path) -> None:
     run = tmp_path / "run"
     program = [sys.executable, "-c", "from pegasus_jax.cli import train; train()"]

@@ -13,8 +13,6 @@ from pegasus_jax.trial import COLLECT, EVALUATE, FIT, IMAGINE, RESTART, SEARCH, 
 from pegasus_jax.types import Policy, Prediction
 from probes import Counter, cart, dial, noisy_linear_policy, regression, same, tiny, unchecked
 
-pytestmark = pytest.mark.usefixtures("quick_compile")
-
 TRIALS, EPISODES = 3, 4
 QUICK = dict(trials=TRIALS, fit__steps=12, search__steps=6, search__particles=5)
 
