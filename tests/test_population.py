@@ -100,6 +100,7 @@ def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_
 
     begun = jax.vmap(lambda own: descent().run(None, Learner(own, descent().init(own)), DEEPER, first=0, steps=3)[0])
     first, second = members(lasting=True)
+    assert len(set(first.optimizer.params.tolist())) == STARTS
     np.testing.assert_allclose(second.optimizer.params, begun(first.optimizer.params).params, rtol=1e-6)
     first, second = members(lasting=False)
     np.testing.assert_allclose(second.optimizer.params[0], begun(first.params[None]).params[0], rtol=1e-6)
