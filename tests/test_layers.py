@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = {
     0: "types config variants",
     1: "angles mesh dropout whiten moments gaussian cost course dataset scenarios rollout episode calibration",
-    2: "network noisy kernel fit lbfgs search population pilco",
+    2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",
@@ -38,6 +38,8 @@ SIBLINGS: set[tuple[str, str]] = {
     ("lbfgs", "fit"),  # what every fit reports
     ("policy.external", "policy.squash"),  # every controller saturates the same ways
     ("noisy", "network"),  # the one network, with noise on its units
+    ("mechanics", "network"),  # a mechanism's energies are that network
+    ("mechanics_kernel", "mechanics"),  # the same equations, where they are compiled by hand
     ("search", "fit"),  # one guarded optimiser, one count of skipped updates
 }
 

@@ -38,7 +38,7 @@ def rollout(
     back through a particle's state that is longer than that.
     """
     act = jax.vmap(policy.apply, (None, 0, 0))
-    predict = jax.vmap(dynamics.apply, (None, 0, 0, 0))
+    predict = dynamics.particles or jax.vmap(dynamics.apply, (None, 0, 0, 0))
 
     def step(carry: tuple[Array, Array], draws: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple]:
         x, seeing = carry

@@ -8,14 +8,10 @@ import jax.scipy.stats
 import numpy as np
 
 from pegasus_jax.angles import encode
+from pegasus_jax.mechanics import GREATEST_CHANGE, GREATEST_SPEED, LEAST_MASS
 from pegasus_jax.noisy import Head, Masks, noisy
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 from pegasus_jax.whiten import whitener
-
-# In units of the data's own deviations: the least diagonal of the mass matrix's factor, and the greatest change of a
-# speed in a control period. Where there are no data a mass matrix may be all but singular, and nothing else would keep
-# a particle from going to infinity within one step.
-LEAST_MASS, GREATEST_CHANGE, GREATEST_SPEED = 0.1, 20.0, 6.0
 
 # Of Student's t, the likelihood. A pendulum that spins fast turns by radians between two steps of the integration, and
 # no energies explain its next state: under a Gaussian, whose noise the head limits, a single such row would outweigh
@@ -52,6 +48,8 @@ def lagrangian(
     rates: tuple[int, ...],
     dt: float,
     substeps: int,
+    hidden: tuple[int, ...],
+    activation: str,
     head: Head,
     weight_decay: float = 1.0,
     **noise: Any,
@@ -72,7 +70,8 @@ def lagrangian(
     n = len(coordinates)
     turning = tuple(i for i, coordinate in enumerate(coordinates) if coordinate in angles)
     rows, columns = np.tril_indices(n)
-    network = noisy(features=n + len(turning), outputs=len(rows) + 1, weight_decay=weight_decay, **noise)
+    widths: dict[str, Any] = dict(features=n + len(turning), hidden=hidden, outputs=len(rows) + 1)
+    network = noisy(**widths, activation=activation, weight_decay=weight_decay, **noise)
 
     def init(key: Key) -> Params:
         net_key, control_key = jax.random.split(key)
@@ -146,6 +145,20 @@ def lagrangian(
         change = jnp.zeros_like(x).at[coordinates].set(now[0] - start[0]).at[moving].set(now[1] - start[1])
         return Prediction(change, head(belief.params["raw_std"]) * units.change)
 
+    each = jax.vmap(predict, (None, 0, 0, 0))
+    mechanics = dict(turning=turning, dt=dt, substeps=substeps, activation=activation)
+
+    def particles(belief: Belief, masks: Masks, x: Array, u: Array) -> Prediction:
+        if not alone_on_gpu(x):
+            return each(belief, masks, x, u)
+        from pegasus_jax import mechanics_kernel as kernel  # what it needs of JAX is for GPUs
+
+        if not kernel.suits(hidden, n):
+            return each(belief, masks, x, u)
+        order = np.concatenate([coordinates, moving])
+        change = kernel.fused(lambda *arguments: each(*arguments).mean, order, **mechanics)(belief, masks, x, u)
+        return Prediction(change, jnp.broadcast_to(head(belief.params["raw_std"]) * belief.units.change, x.shape))
+
     def loss(params: Params, key: Key, batch: Batch, units: Units) -> Array:
         """Eq. 2 / N, but of Student's t, with fresh noise for every row; the constants have the weights' prior."""
         masks = network.sample(key, params["noise"], batch.x.shape[0])
@@ -161,7 +174,13 @@ def lagrangian(
         condition=lambda params, data: Belief(params, prepare(data)),
         sample=lambda key, belief: network.sample(key, belief.params["noise"]),
         apply=predict,
+        particles=particles,
     )
+
+
+def alone_on_gpu(x: Array) -> bool:
+    """Whether a kernel of ours may compute in x's place: the compiler splits its own over devices, but not ours."""
+    return jax.default_backend() == "gpu" and jax.device_count() == 1 and x.dtype == jnp.float32
 
 
 def within(v: Array, limit: Array | float) -> Array:

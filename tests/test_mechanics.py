@@ -1,0 +1,87 @@
+"""The mechanism's GPU kernel, interpreted, against the plain form: values and gradients. And that it compiles."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_jax import dropout
+from pegasus_jax import mechanics_kernel as kernel
+from pegasus_jax.dynamics.lagrangian import lagrangian
+from pegasus_jax.noisy import HEADS
+from pegasus_jax.types import Array, Dataset
+
+# x in the order of a user's, with angles and rates anywhere; widths that are no powers of two are filled up.
+DOUBLE = dict(states=6, controls=1, angles=(4, 5), rates=(1, 2, 3), hidden=(32, 32), activation="silu")
+SINGLE = dict(states=4, controls=2, angles=(3,), rates=(2, 1), hidden=(20, 17, 5), activation="tanh")
+RELU = dict(states=2, controls=1, angles=(), rates=(1,), hidden=(16,), activation="relu")
+K = 21  # no whole number of blocks
+
+
+def pieces(case: dict, noise: dropout.Dropout, substeps: int) -> tuple:
+    """(plain, fused, belief, masks, x, u) of random data in single precision."""
+    model = lagrangian(**case, dropout=noise, dt=0.1, substeps=substeps, head=HEADS["sigmoid"])
+    d, c = case["states"], case["controls"]
+    random = np.random.default_rng(0)
+    x, u, y = (jnp.asarray(random.normal(size=(50, n)), jnp.float32) for n in (d, c, d))
+    params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), model.init(jax.random.key(1)))
+    params["constant"], params["resistance"] = (jnp.full_like(params[name], 0.3) for name in ("constant", "resistance"))
+    belief = model.condition(params, Dataset(3.0 * x, u, y, jnp.int32(50)))
+    masks = jax.vmap(lambda key: model.sample(key, belief))(jax.random.split(jax.random.key(2), K))
+    masks = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), masks)
+    each = jax.vmap(model.apply, (None, 0, 0, 0))
+    order = np.array([*(i for i in range(d) if i not in case["rates"]), *case["rates"]])
+    coordinates = order[: d // 2]
+    turning = tuple(i for i, coordinate in enumerate(coordinates) if coordinate in case["angles"])
+
+    def plain(*arguments: Array) -> Array:
+        return each(*arguments).mean
+
+    mechanics = dict(turning=turning, dt=0.1, substeps=substeps, activation=case["activation"])
+    fused = {on: kernel.fused(plain, order, **mechanics, interpret=on) for on in (True, False)}
+    return plain, fused, belief, masks, 2.0 * x[:K], u[:K]
+
+
+CASES = [
+    pytest.param(DOUBLE, dropout.log_normal(-10.0, 0.0), 2, id="two poles"),
+    pytest.param(SINGLE, dropout.none(), 1, id="one pole, two controls"),
+    pytest.param(RELU, dropout.binary(0.1), 3, id="no pole"),
+]
+
+
+@pytest.mark.parametrize(("case", "noise", "substeps"), CASES)
+def test_as_the_plain_form(case: dict, noise: dropout.Dropout, substeps: int) -> None:
+    plain, fused, *arguments = pieces(case, noise, substeps)
+    weight = jax.random.normal(jax.random.key(3), (K, case["states"]))
+
+    def both(change: object) -> tuple:
+        value = lambda *given: jnp.sum(weight * change(*given))  # noqa: E731
+        return jax.jit(change)(*arguments), jax.jit(jax.grad(value, (0, 1, 2, 3), allow_int=True))(*arguments)
+
+    expected, gradients = both(plain)
+    got, ours = both(fused[True])
+    np.testing.assert_allclose(got, expected, rtol=2e-5, atol=2e-5)
+    for mine, theirs in zip(jax.tree.leaves(ours), jax.tree.leaves(gradients), strict=True):
+        if mine.dtype == jnp.float32:
+            np.testing.assert_allclose(mine, theirs, rtol=2e-4, atol=2e-5 * (1 + float(jnp.max(jnp.abs(theirs)))))
+
+
+@pytest.mark.parametrize(("case", "noise", "substeps"), CASES)
+def test_compiles_for_a_gpu_that_is_not_there(case: dict, noise: dropout.Dropout, substeps: int) -> None:
+    """Down to the kernel compiler's own language, with seeds and policies as further axes."""
+    _, fused, belief, masks, x, u = pieces(case, noise, substeps)
+
+    def slope(belief: object, masks: object, x: Array) -> Array:
+        return jax.grad(lambda x: jnp.sum(fused[False](belief, masks, x, u)))(x)
+
+    seeds = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), (belief, masks, jnp.stack([x] * 3)))
+    policies = jax.vmap(slope, (None, None, 0))
+    text = jax.jit(jax.vmap(policies)).trace(*seeds).lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("@__gpu$xla.gpu.triton") == 2, "there and back"
+
+
+def test_it_is_for_small_mechanisms() -> None:
+    assert kernel.suits((32, 32), 3)
+    assert not kernel.suits((200, 200), 3)
+    assert not kernel.suits((), 3)
+    assert not kernel.suits((32,), 7)
