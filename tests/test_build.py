@@ -19,7 +19,8 @@ from pegasus_jax.build import (
     search_of,
     start,
 )
-from pegasus_jax.config import DROPOUTS, Config, Period, SettingError
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import DROPOUTS, Config, Period
 from pegasus_jax.dynamics.gp import gp
 from pegasus_jax.dynamics.ssgp import ssgp
 from pegasus_jax.gaussian import affine

@@ -16,7 +16,8 @@ from pegasus_jax.build import (
     fit_of,
     start,
 )
-from pegasus_jax.config import Period, SettingError
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import Period
 from pegasus_jax.fit import falling
 from pegasus_jax.search import objective
 from pegasus_jax.trial import SEARCH, trial_key
@@ -152,6 +153,20 @@ def test_a_limit_reaches_the_gradient_as_a_share_of_each_particle():
     assert plain.objective[0] == short.objective[0]
     assert short.gradient_norm[0] < 0.9 * plain.gradient_norm[0]
     np.testing.assert_allclose(same.gradient_norm[0], plain.gradient_norm[0], rtol=1e-5)
+
+
+def test_a_limit_that_is_loosened_must_be_there():
+    with pytest.raises(SettingError, match=r"search.loosen=30 needs a limit to loosen: search.limit=1"):
+        config.Search(loosen=30)
+
+
+def test_a_limit_is_loosened_over_the_search():
+    """The same scenarios and all but the same policy twice; the second time the limit is a million times as long."""
+    still = dict(steps=2, learning_rate=1e-9, period=Period(0, 0, 0, 0, 0))
+    (_, state, run), (_, _, loosened) = searcher(**still), searcher(**still, limit=1e-3, loosen=1e12)
+    plain, norm = (f(state)[1].gradient_norm for f in (run, loosened))
+    assert norm[0] < 0.9 * plain[0]
+    np.testing.assert_allclose(norm[1], plain[1], rtol=1e-5)
 
 
 def test_a_step_size_falls_as_half_a_cosine_and_begins_again():

@@ -6,7 +6,8 @@ import math
 import pytest
 
 from pegasus_jax import config
-from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search, SettingError, nearest
+from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
 
 
 def test_a_config_is_a_key():

@@ -10,7 +10,8 @@ import pytest
 from benchmarks import results_page
 from benchmarks.study import RESULTS
 from pegasus_jax.build import build
-from pegasus_jax.config import BNN, RBF, SSGP, Analytic, Config, SettingError
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import BNN, RBF, SSGP, Analytic, Config
 from pegasus_jax.report import claims, comparison
 from pegasus_jax.report.curves import interval, middle
 from pegasus_jax.report.figures import Claim, Figure, read

@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
-    0: "types config variants",
+    0: "types checks config variants",
     1: "angles mesh dropout whiten moments gaussian cost course dataset scenarios rollout episode calibration",
     2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco",
     3: "dynamics. policy. trial",
@@ -26,6 +26,7 @@ TOP = max(LAYERS)  # the layer that is an application: here modules may import e
 
 # (importer, imported), both of one layer below TOP.
 SIBLINGS: set[tuple[str, str]] = {
+    ("config", "checks"),  # a setting is checked when it is made
     ("variants", "config"),  # a variant is made of settings
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
     ("calibration", "angles"),  # an error of 359 degrees is one of 1

@@ -16,7 +16,8 @@ import pytest
 from pegasus_envs import mjcf
 from pegasus_envs.render import frames
 from pegasus_jax import record, settings, tasks
-from pegasus_jax.config import Config, SettingError
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import Config
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
 PENDULUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "inverted_pendulum.xml"

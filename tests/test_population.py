@@ -11,7 +11,7 @@ import pytest
 
 from pegasus_jax import config
 from pegasus_jax.build import compose
-from pegasus_jax.config import SettingError
+from pegasus_jax.checks import SettingError
 from pegasus_jax.population import best_of
 from pegasus_jax.search import SearchInfo
 from pegasus_jax.types import Learner, Searcher

@@ -14,7 +14,7 @@ import pytest
 
 from pegasus_jax import record
 from pegasus_jax.build import compose
-from pegasus_jax.program import over_seeds
+from pegasus_jax.program import Program, over_seeds
 from probes import cart, tiny, unchecked
 from test_train import TINY, call, fingerprint, program
 
@@ -53,6 +53,20 @@ def test_a_seed_among_others_leaves_what_it_leaves_alone(study: Path, tmp_path: 
         for name in ("mean_cost", "objective_first", "objective_last", "objective_fresh"):
             assert a[name] == pytest.approx(b[name], abs=2e-3), name
     assert fingerprint(study / "seed1") != fingerprint(among)
+
+
+def test_evaluation_episodes_cost_the_same_side_by_side() -> None:
+    experiment = compose(tiny(), cart())
+    params = jax.vmap(experiment.init)(jax.random.split(jax.random.key(1), 2)).policy.params
+
+    def costs(side_by_side: bool) -> np.ndarray:
+        keys = jax.random.split(jax.random.key(0), (2, 3))
+        return unchecked(Program(experiment, 1, 2, side_by_side=side_by_side).evaluate)(keys, params)
+
+    alone, together = costs(False), costs(True)
+    assert alone.shape == (2, 3, experiment.task.horizon)
+    assert np.ptp(alone[..., -1]) > 0
+    np.testing.assert_allclose(alone, together, atol=1e-5)
 
 
 def test_the_cores_of_a_processor_share_the_seeds(study: Path) -> None:

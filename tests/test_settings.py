@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from pegasus_jax import config, settings
 from pegasus_jax.build import compose
-from pegasus_jax.config import BNN, MLP, RBF, Analytic, Config, Explore, Fit, Lagrangian, Period, Search, SettingError
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import BNN, MLP, RBF, Analytic, Config, Explore, Fit, Lagrangian, Period, Search
 from pegasus_jax.tasks import TASKS, defaults
 from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 from probes import cart

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pegasus_jax import record, settings
-from pegasus_jax.config import SettingError
+from pegasus_jax.checks import SettingError
 from pegasus_jax.sweep import check, handle, jobs_of, values
 from test_train import TINY
 

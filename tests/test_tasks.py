@@ -14,7 +14,8 @@ import pytest
 
 from pegasus_jax import record, settings, tasks
 from pegasus_jax.build import build
-from pegasus_jax.config import Config, SettingError
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import Config
 
 # (task, legs, states, controls, horizon, control period [s])
 SHAPES = [

@@ -11,8 +11,9 @@ from jax.sharding import Mesh
 
 from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco, scenarios, tasks, trial
 from pegasus_jax import config as settings
+from pegasus_jax.checks import SettingError
 from pegasus_jax.cost import of_particles
-from pegasus_jax.course import Course, either, narrowing, pace
+from pegasus_jax.course import Course, either, loosening, narrowing, pace
 from pegasus_jax.dynamics.bnn import bnn
 from pegasus_jax.dynamics.ensemble import ensemble
 from pegasus_jax.dynamics.gp import gp
@@ -134,7 +135,7 @@ def search_of(
         return analytic_search_of(search, task, dynamics, policy, discounted(search, aggregate), noise)
     if (search.match or search.balanced) and search.particles <= len(task.state_names):
         states, what = len(task.state_names), "moment matching" if search.match else "balanced draws"
-        raise settings.SettingError(
+        raise SettingError(
             f"search.particles={search.particles} is too few: {what} of {states} dimensions needs at least {states + 1}"
         )
     if search.risk < 1:
@@ -143,7 +144,7 @@ def search_of(
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
     # A particle's cost is 1 / K of the objective.
     limit = None if search.limit is None else search.limit / search.particles
-    ends: dict[str, Any] = dict(aggregate=discounted(search, aggregate), truncate=search.truncate, limit=limit)
+    ends: dict[str, Any] = dict(aggregate=discounted(search, aggregate), truncate=search.truncate)
     match = moments.match if search.match else moments.keep
     costs = costs_of(search, task)
     # The last part of a search is for refining: no matching, each particle's own cost, at its own width.
@@ -151,12 +152,14 @@ def search_of(
     steps = search.anneal * search.steps
     narrow = (steps if refine is None else refine) / 2 if search.widen > 1 else 0
     width = narrowing(search.widen, narrow) if narrow else None
+    loose = loosening(search.loosen, steps) if search.loosen > 1 else None
 
     def value(params: Params, belief: Params, given: Scenarios, iteration: Array) -> Array:
         refining = None if refine is None else iteration >= refine
         cost = costs(refining, width and width(iteration))
         onwards = either(refining, moments.keep, match)
-        return objective(params, belief, given, **pieces, **ends, match=onwards, cost=cost)
+        longest = limit * loose(iteration) if limit and loose else limit
+        return objective(params, belief, given, **pieces, **ends, limit=longest, match=onwards, cost=cost)
 
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
@@ -190,9 +193,9 @@ def analytic_search_of(
 ) -> tuple[Searcher, Imagine]:
     """PILCO's search. Raises SettingError where a piece has no moments."""
     if dynamics.moments is None:
-        raise settings.SettingError("algorithm=pilco needs a model with analytic moments: model=ssgp, model=gp")
+        raise SettingError("algorithm=pilco needs a model with analytic moments: model=ssgp, model=gp")
     if policy.moments is None:
-        raise settings.SettingError(
+        raise SettingError(
             "algorithm=pilco needs a policy with analytic moments, saturated by sines: policy=rbf, policy=linear"
         )
     mean, std = jnp.asarray(task.start_mean, float), jnp.asarray(task.start_std, float)
@@ -231,7 +234,7 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
     if search.cost == "matched":
         expected_cost_of(task, "search.cost=matched")
     if search.widen > 1 and task.widened is None:
-        raise settings.SettingError(
+        raise SettingError(
             f"search.widen={search.widen:g} needs a cost with a width, which that of task={task.name} lacks;"
             " the nearest is 1"
         )
@@ -251,7 +254,7 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
 def expected_cost_of(task: Task, setting: str) -> cost.Expected:
     """The task's expected cost of a Gaussian state. Raises SettingError, naming the setting, where it is not known."""
     if task.expected_cost is None:
-        raise settings.SettingError(
+        raise SettingError(
             f"{setting} needs a cost whose expectation is known in closed form, and that of task={task.name} is not"
         )
     return task.expected_cost
@@ -342,7 +345,7 @@ def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
     try:
         return NOISES[config.dropout](config)
     except ValueError as error:
-        raise settings.SettingError(f"model.dropout={config.dropout}: {error}") from error
+        raise SettingError(f"model.dropout={config.dropout}: {error}") from error
 
 
 def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task) -> Policy:

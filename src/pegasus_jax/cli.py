@@ -9,7 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pegasus_jax.config import Config, SettingError
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import Config
 
 TRAIN = """\
 pegasus-train task=NAME [setting=value ...]     learn a controller
@@ -282,7 +283,7 @@ def _figures(words: Sequence[str]) -> None:
 def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False) -> tuple[Path, dict[str, str]]:
     """The run's folder, or with `many` maybe that of several seeds, and the options of a command that reads it."""
     from pegasus_jax import record, settings
-    from pegasus_jax.config import nearest
+    from pegasus_jax.checks import nearest
 
     named = [word for word in words if "=" not in word]
     if len(named) != 1:

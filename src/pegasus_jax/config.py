@@ -4,58 +4,12 @@ Values are checked when a config is made; a bad one raises `SettingError`, which
 """
 
 import dataclasses
-import difflib
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
-
-class SettingError(ValueError):
-    """A setting that cannot be; the message is one line for the person who set it."""
-
-
-def nearest(name: str, choices: Iterable[str]) -> str:
-    """The end of an error message: the nearest valid choice, and all of them."""
-    choices = [str(c) for c in choices]
-    close = difflib.get_close_matches(str(name), choices, n=1, cutoff=0.4)
-    hint = f"did you mean '{close[0]}'? " if close else ""
-    return f"{hint}choices: {', '.join(choices)}"
-
-
-def _choice(name: str, value: Any, choices: Iterable[Any]) -> None:
-    if value not in tuple(choices):
-        raise SettingError(f"{name}={value} is not a choice; {nearest(value, choices)}")
-
-
-def _within(name: str, value: float, low: float, high: float = math.inf, *, open_low: bool = False) -> None:
-    if not math.isfinite(value) or value > high or value < low or (open_low and value == low):
-        interval = f"{'(' if open_low else '['}{_number(low)}, {_number(high)}{')' if high == math.inf else ']'}"
-        nearest_value = min(max(value, low), high) if math.isfinite(value) and not open_low else None
-        hint = f"; the nearest is {_number(nearest_value)}" if nearest_value is not None else ""
-        raise SettingError(f"{name}={_number(value)} is out of range; expected a number in {interval}{hint}")
-
-
-def _number(value: float) -> str:
-    """A number in full when it is whole, else short."""
-    return str(int(value)) if math.isfinite(value) and value == int(value) else f"{value:g}"
-
-
-def _layers(name: str, value: Any) -> tuple[int, ...]:
-    layers = tuple(value)
-    for width in layers:
-        if not isinstance(width, int):
-            raise SettingError(f"{name}={list(layers)} is not a list of whole numbers; for example {name}=[200,200]")
-        _within(name, width, 1)
-    return layers
-
-
-def _kind(section: str, value: str, kind: str) -> None:
-    """A section's kind says which class it is; a variant changes it, never a single setting."""
-    if value != kind:
-        raise SettingError(
-            f"{section}.kind={value} cannot be set: model=, policy= and algorithm= choose what {section} is"
-        )
+from pegasus_jax import checks
+from pegasus_jax.checks import SettingError
 
 
 def setting(default: Any, text: str) -> Any:
@@ -95,15 +49,15 @@ class _Network:
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
-        _kind("model", self.kind, type(self).kind)
-        _within("model.members", self.members, 1)
-        object.__setattr__(self, "hidden", _layers("model.hidden", self.hidden))
+        checks.kind("model", self.kind, type(self).kind)
+        checks.within("model.members", self.members, 1)
+        object.__setattr__(self, "hidden", checks.layers("model.hidden", self.hidden))
         kinds = dict(activation=ACTIVATIONS, dropout=DROPOUTS, head=HEADS, initialiser=INITIALISERS)
         for name, choices in kinds.items():
-            _choice(f"model.{name}", getattr(self, name), choices)
-        _within("model.rate", self.rate, 0, 0.99)
-        for name, least in (("kl_weight", 0), ("weight_decay", 0), ("low", -math.inf), ("high", -math.inf)):
-            _within(f"model.{name}", getattr(self, name), least)
+            checks.choice(f"model.{name}", getattr(self, name), choices)
+        checks.within("model.rate", self.rate, 0, 0.99)
+        checks.least("model", self, 0, "kl_weight", "weight_decay")
+        checks.least("model", self, -math.inf, "low", "high")
         if not self.low < self.high:
             raise SettingError(f"model.low={self.low:g} must be less than model.high={self.high:g}")
 
@@ -119,7 +73,7 @@ class BNN(_Network):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _choice("model.whitening", self.whitening, ("full", "diagonal"))
+        checks.choice("model.whitening", self.whitening, ("full", "diagonal"))
 
 
 @dataclass(frozen=True)
@@ -132,7 +86,7 @@ class Lagrangian(_Network):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        _within("model.substeps", self.substeps, 1)
+        checks.within("model.substeps", self.substeps, 1)
 
 
 @dataclass(frozen=True)
@@ -143,8 +97,8 @@ class GP:
     features: int = setting(200, "sines and cosines in a particle's function, before the data correct it")
 
     def __post_init__(self) -> None:
-        _kind("model", self.kind, "gp")
-        _within("model.features", self.features, 2)
+        checks.kind("model", self.kind, "gp")
+        checks.within("model.features", self.features, 2)
         if self.features % 2:
             raise SettingError(f"model.features={self.features} must be even; the nearest is {self.features + 1}")
 
@@ -157,8 +111,8 @@ class SSGP:
     points: int = setting(100, "frequencies of each dimension, a cosine and a sine each")
 
     def __post_init__(self) -> None:
-        _kind("model", self.kind, "ssgp")
-        _within("model.points", self.points, 1)
+        checks.kind("model", self.kind, "ssgp")
+        checks.within("model.points", self.points, 1)
 
 
 @dataclass(frozen=True)
@@ -175,14 +129,14 @@ class MLP:
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
-        _kind("policy", self.kind, "mlp")
-        object.__setattr__(self, "hidden", _layers("policy.hidden", self.hidden))
+        checks.kind("policy", self.kind, "mlp")
+        object.__setattr__(self, "hidden", checks.layers("policy.hidden", self.hidden))
         for name, choices in (("squash", SQUASHES), ("execution", EXECUTIONS), ("initialiser", INITIALISERS)):
-            _choice(f"policy.{name}", getattr(self, name), choices)
-        _within("policy.dropout", self.dropout, 0, 0.99)
+            checks.choice(f"policy.{name}", getattr(self, name), choices)
+        checks.within("policy.dropout", self.dropout, 0, 0.99)
         object.__setattr__(self, "input_units", tuple(self.input_units))
         for name, value in (("output_scale", self.output_scale), *(("input_units", unit) for unit in self.input_units)):
-            _within(f"policy.{name}", value, 0, open_low=True)
+            checks.within(f"policy.{name}", value, 0, open_low=True)
 
 
 @dataclass(frozen=True)
@@ -195,9 +149,9 @@ class RBF:
     execution = "mean"  # no setting: there is nothing to sample
 
     def __post_init__(self) -> None:
-        _kind("policy", self.kind, "rbf")
-        _within("policy.units", self.units, 1)
-        _choice("policy.squash", self.squash, SQUASHES)
+        checks.kind("policy", self.kind, "rbf")
+        checks.within("policy.units", self.units, 1)
+        checks.choice("policy.squash", self.squash, SQUASHES)
 
 
 @dataclass(frozen=True)
@@ -209,8 +163,8 @@ class Linear:
     execution = "mean"  # no setting: there is nothing to sample
 
     def __post_init__(self) -> None:
-        _kind("policy", self.kind, "linear")
-        _choice("policy.squash", self.squash, SQUASHES)
+        checks.kind("policy", self.kind, "linear")
+        checks.choice("policy.squash", self.squash, SQUASHES)
 
 
 @dataclass(frozen=True)
@@ -225,11 +179,11 @@ class Fit:
     reset: bool = setting(False, "forget Adam's moments at each trial")
 
     def __post_init__(self) -> None:
-        _kind("fit", self.kind, "adam")
-        _within("fit.steps", self.steps, 1)
-        _within("fit.batch", self.batch, 1)
-        _within("fit.learning_rate", self.learning_rate, 0, open_low=True)
-        _within("fit.decay", self.decay, 0, 1)
+        checks.kind("fit", self.kind, "adam")
+        checks.within("fit.steps", self.steps, 1)
+        checks.within("fit.batch", self.batch, 1)
+        checks.within("fit.learning_rate", self.learning_rate, 0, open_low=True)
+        checks.within("fit.decay", self.decay, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -241,9 +195,9 @@ class LBFGS:
     starts: int = setting(100, "fresh parameters, of which the best, or the current ones, begin")
 
     def __post_init__(self) -> None:
-        _kind("fit", self.kind, "lbfgs")
-        _within("fit.steps", self.steps, 1)
-        _within("fit.starts", self.starts, 1)
+        checks.kind("fit", self.kind, "lbfgs")
+        checks.within("fit.steps", self.steps, 1)
+        checks.within("fit.starts", self.starts, 1)
 
 
 @dataclass(frozen=True)
@@ -258,7 +212,7 @@ class Period:
 
     def __post_init__(self) -> None:
         for f in dataclasses.fields(self):
-            _within(f"search.period.{f.name}", getattr(self, f.name), 0)
+            checks.within(f"search.period.{f.name}", getattr(self, f.name), 0)
 
 
 @dataclass(frozen=True)
@@ -282,6 +236,7 @@ class Search:
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
     limit: float | None = setting(None, "a particle's gradient by its state that is longer is dropped; null: none is")
+    loosen: float = setting(1.0, "the limit at the end of a search, or of `anneal` trials' searches, as a factor")
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
@@ -293,24 +248,26 @@ class Search:
     period: Period = Period()
 
     def __post_init__(self) -> None:
-        _kind("search", self.kind, "particles")
-        least = dict(steps=1, particles=2, widen=1, anneal=1, starts=1, policy_noise=0, state_noise=0, cost_noise=0)
-        for name, value in least.items():
-            _within(f"search.{name}", getattr(self, name), value)
-        _within("search.learning_rate", self.learning_rate, 0, open_low=True)
-        _within("search.decay", self.decay, 0, 1)
+        checks.kind("search", self.kind, "particles")
+        checks.least("search", self, 0, "policy_noise", "state_noise", "cost_noise")
+        checks.least("search", self, 1, "steps", "widen", "anneal", "starts", "loosen")
+        checks.least("search", self, 2, "particles")
+        checks.within("search.learning_rate", self.learning_rate, 0, open_low=True)
+        checks.within("search.decay", self.decay, 0, 1)
         for name, choices in (("aggregate", AGGREGATES), ("cost", COSTS), ("sensors", SENSORS)):
-            _choice(f"search.{name}", getattr(self, name), choices)
-        _within("search.discount", self.discount, 0, 1, open_low=True)
-        _within("search.risk", self.risk, 0, 1, open_low=True)
+            checks.choice(f"search.{name}", getattr(self, name), choices)
+        checks.within("search.discount", self.discount, 0, 1, open_low=True)
+        checks.within("search.risk", self.risk, 0, 1, open_low=True)
         if self.risk < 1 and self.cost == "matched":
             raise SettingError(f"search.risk={self.risk:g} needs the cost of each particle: search.cost=particles")
-        _within("search.refine", self.refine, 0, 1)
+        checks.within("search.refine", self.refine, 0, 1)
         if self.truncate is not None:
-            _within("search.truncate", self.truncate, 1)
+            checks.within("search.truncate", self.truncate, 1)
         for name, value in (("clip", self.clip), ("limit", self.limit)):
             if value is not None:
-                _within(f"search.{name}", value, 0, open_low=True)
+                checks.within(f"search.{name}", value, 0, open_low=True)
+        if self.loosen > 1 and self.limit is None:
+            raise SettingError(f"search.loosen={self.loosen:g} needs a limit to loosen: search.limit=1")
         if self.anneal > 1 and (self.refine or self.best):
             raise SettingError(f"search.anneal={self.anneal} needs search.refine=0 search.best=false")
         if self.starts > 1 and not self.reset:
@@ -333,13 +290,12 @@ class Analytic:
     reset, anneal, sensors = True, 1, "predicted"  # no settings: curvature is that of one model
 
     def __post_init__(self) -> None:
-        _kind("search", self.kind, "analytic")
-        _within("search.steps", self.steps, 1)
-        _within("search.particles", self.particles, 2)
-        _choice("search.aggregate", self.aggregate, AGGREGATES)
-        _within("search.discount", self.discount, 0, 1, open_low=True)
-        for name in ("policy_noise", "state_noise", "cost_noise"):
-            _within(f"search.{name}", getattr(self, name), 0)
+        checks.kind("search", self.kind, "analytic")
+        checks.least("search", self, 0, "policy_noise", "state_noise", "cost_noise")
+        checks.least("search", self, 1, "steps")
+        checks.least("search", self, 2, "particles")
+        checks.choice("search.aggregate", self.aggregate, AGGREGATES)
+        checks.within("search.discount", self.discount, 0, 1, open_low=True)
 
 
 @dataclass(frozen=True)
@@ -350,8 +306,8 @@ class Explore:
     kind: str = setting("uniform", "uniform: a fresh control each step; walk: a random walk")
 
     def __post_init__(self) -> None:
-        _within("explore.trials", self.trials, 0)
-        _choice("explore.kind", self.kind, EXPLORATIONS)
+        checks.within("explore.trials", self.trials, 0)
+        checks.choice("explore.kind", self.kind, EXPLORATIONS)
 
 
 Model = BNN | GP | SSGP | Lagrangian
@@ -386,15 +342,15 @@ class Config:
     explore: Explore = Explore()
 
     def __post_init__(self) -> None:
-        _choice("legs", self.legs, LEGS)
-        _choice("precision", self.precision, PRECISIONS)
+        checks.choice("legs", self.legs, LEGS)
+        checks.choice("precision", self.precision, PRECISIONS)
         for name in ("angles", "rates", "observe", "control_low", "control_high", "start_mean", "start_std"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for deviation in self.start_std:
-            _within("start_std", deviation, 0)
+            checks.within("start_std", deviation, 0)
         if self.dt is not None:
-            _within("dt", self.dt, 0, open_low=True)
+            checks.within("dt", self.dt, 0, open_low=True)
         if self.horizon is not None:
-            _within("horizon", self.horizon, 1)
-        _within("seed", self.seed, 0, 2**32 - 1)
-        _within("trials", self.trials, 1, 10_000)
+            checks.within("horizon", self.horizon, 1)
+        checks.within("seed", self.seed, 0, 2**32 - 1)
+        checks.within("trials", self.trials, 1, 10_000)

@@ -31,6 +31,11 @@ def narrowing(widest: float, over: float) -> Schedule:
     return lambda i: widest ** jnp.maximum(0.0, 1 - i / over)
 
 
+def loosening(most: float, over: float) -> Schedule:
+    """A factor that rises from 1 at iteration 0 to `most` at iteration `over`, geometrically."""
+    return lambda i: most ** jnp.minimum(1.0, i / over)
+
+
 def pace(steps: int, decay: float, refine: int | None = None) -> Schedule | None:
     """A factor of the step size: in `steps` it falls from 1 to `decay`, as half a cosine; None if it is always 1.
 

@@ -50,13 +50,24 @@ class Program:
     With a mesh, the seeds lie on its devices; those of several processes call every part together.
     """
 
-    def __init__(self, experiment: Experiment, search_steps: int, seeds: int = 1, over: Mesh | None = None) -> None:
+    def __init__(
+        self,
+        experiment: Experiment,
+        search_steps: int,
+        seeds: int = 1,
+        over: Mesh | None = None,
+        side_by_side: bool | None = None,
+    ) -> None:
         self.mesh, self.seeds = over, seeds
+        # Evaluation episodes. A GPU takes as long for one as for twenty; a processor does not, and would have one
+        # more program to compile.
+        self.side_by_side = jax.default_backend() != "cpu" if side_by_side is None else side_by_side
         self.chunk = chunk(search_steps)
         self.chunks = search_steps // self.chunk
         functions = {
             "init": (experiment.init, (0,)),
             "episode": (experiment.episode, (0, 0, None)),
+            "evaluate": (jax.vmap(experiment.episode, (0, None, None)), (0, 0, None)),
             "absorb": (experiment.absorb, (0, 0)),
             "fit": (experiment.fit, (0,)),
             "search": (partial(experiment.search, steps=self.chunk), (0, None)),
@@ -104,6 +115,14 @@ class Program:
         self.spent[name] = self.spent.get(name, 0.0) + time.monotonic() - began - compiling
         self.spent["compile"] = self.spent.get("compile", 0.0) + compiling
         return result
+
+    def evaluate(self, keys: Any, params: Any) -> np.ndarray:
+        """Costs [S, E, H] of episodes of the policies, one for each key [S, E]."""
+        follow = jnp.asarray(False)  # the policy, not random controls
+        if self.side_by_side:
+            return np.asarray(fetched(self("evaluate", keys, params, follow).cost))
+        several = (self("episode", some, params, follow, purpose="evaluate") for some in jnp.swapaxes(keys, 0, 1))
+        return np.stack([np.asarray(fetched(episode.cost)) for episode in several], axis=1)
 
     def seconds(self) -> dict[str, float]:
         """Seconds spent in each part since the last call."""

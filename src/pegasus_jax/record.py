@@ -26,7 +26,7 @@ import jax
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pegasus_jax.config import SettingError
+from pegasus_jax.checks import SettingError
 from pegasus_jax.types import Rollout, Task, Trajectory
 
 

@@ -28,7 +28,7 @@ def rollout(
     match: Callable[[Array, Array], Array],
     noise: NoiseUse = NoiseUse(),
     truncate: int | None = None,
-    limit: float | None = None,
+    limit: Array | float | None = None,
 ) -> Rollout:
     """Roll K particles out for H steps (Alg. 3 lines 6 to 14).
 
@@ -62,7 +62,7 @@ def rollout(
     return Rollout(jnp.concatenate([start[None], x]), u, std, seen)
 
 
-def limited(x: Array, limit: float) -> Array:
+def limited(x: Array, limit: Array | float) -> Array:
     """x [K, D] itself, whose gradient is dropped in the rows where it is longer than `limit`, or not finite.
 
     On a plant that is chaotic the gradient of one particle can be 1e9 times that of the others: summed up, it would
@@ -70,10 +70,10 @@ def limited(x: Array, limit: float) -> Array:
     steps up to where chaos sets in, and no further.
     """
 
-    def short(_: None, gradient: Array) -> tuple[Array]:
+    def short(limit: Array, gradient: Array) -> tuple[Array, Array]:
         square = jnp.sum(gradient**2, -1, keepdims=True)
-        return (jnp.where(square <= limit**2, gradient, 0.0),)  # NaN is not
+        return jnp.where(square <= limit**2, gradient, 0.0), jnp.zeros_like(limit)  # NaN is not
 
-    same = jax.custom_vjp(lambda x: x)
-    same.defvjp(lambda x: (x, None), short)
-    return same(x)  # type: ignore[return-value]
+    same = jax.custom_vjp(lambda x, limit: x)
+    same.defvjp(lambda x, limit: (x, limit), short)
+    return same(x, jnp.asarray(limit, x.dtype))  # type: ignore[return-value]

@@ -60,7 +60,7 @@ def objective(
     aggregate: Callable[[Array], Array] = costs.mean,
     noise: NoiseUse = NoiseUse(),
     truncate: int | None = None,
-    limit: float | None = None,
+    limit: Array | float | None = None,
 ) -> Array:
     """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
     imagined = rollout(

@@ -10,7 +10,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from pegasus_jax import tasks
-from pegasus_jax.config import Config, SettingError, nearest
+from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.config import Config
 from pegasus_jax.record import write_whole
 from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 

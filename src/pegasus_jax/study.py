@@ -13,7 +13,8 @@ import numpy as np
 
 from pegasus_jax import mesh, settings
 from pegasus_jax.build import build, set_precision
-from pegasus_jax.config import Config, SettingError
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import Config
 from pegasus_jax.program import described
 from pegasus_jax.record import write_whole
 from pegasus_jax.tasks import GYM

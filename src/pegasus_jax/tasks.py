@@ -19,7 +19,8 @@ from pegasus_envs.guest import guest
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
-from pegasus_jax.config import Config, SettingError, nearest
+from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.config import Config
 from pegasus_jax.cost import expected_saturating, saturating, widened
 from pegasus_jax.types import Task
 

@@ -1,6 +1,6 @@
 """The main job: an experiment trial by trial, for one seed or many at once, leaving folders that survive anything."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -16,7 +16,8 @@ from tensorboardX import SummaryWriter
 
 from pegasus_jax import checkpoint, record, settings
 from pegasus_jax.build import build, set_precision
-from pegasus_jax.config import Config, SettingError
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import Config
 from pegasus_jax.dataset import grow
 from pegasus_jax.program import Program, fetched, leads
 from pegasus_jax.progress import Display
@@ -120,7 +121,7 @@ def one_trial(
         states, found = improved(states, trial, runs, stacked, program, display)
     display.phase(trial, "evaluate", 0.9)
     keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(fetched(states.key))
-    evaluation = evaluate(keys, states.policy.params, task, partial(program, "episode", purpose="evaluate"), EPISODES)
+    evaluation = evaluate(keys, states.policy.params, task, program, EPISODES)
     seconds = program.seconds()
     rows = [
         {
@@ -188,13 +189,9 @@ def collected(
     return [episode for episode in episodes if episode is not None]
 
 
-def evaluate(
-    keys: Key, params: Params, task: Task, episode: Callable[..., Trajectory], episodes: int
-) -> list[dict[str, float]]:
+def evaluate(keys: Key, params: Params, task: Task, program: Program, episodes: int) -> list[dict[str, float]]:
     """Mean cost a step and success rate of each seed [S], over fresh episodes, not data (docs/reference.md 10)."""
-    follow = jnp.asarray(False)  # the policy, not random controls
-    each = jax.vmap(lambda key: jax.random.split(key, episodes), out_axes=1)(keys)
-    costs = np.stack([np.asarray(fetched(episode(some, params, follow).cost)) for some in each], axis=1)  # [S, E, H]
+    costs = program.evaluate(jax.vmap(lambda key: jax.random.split(key, episodes))(keys), params)
     return [
         {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(success))}
         for cost, success in zip(costs, succeeded(costs, task), strict=True)
@@ -277,7 +274,7 @@ def evaluate_run(run: Path, episodes: int, seed: int) -> dict[str, Any]:
     program = Program(experiment, 1)
     params = jax.tree.map(lambda leaf: leaf[None], state.policy.params)
     keys = jax.random.key(seed)[None]
-    (result,) = evaluate(keys, params, experiment.task, partial(program, "episode"), episodes)
+    (result,) = evaluate(keys, params, experiment.task, program, episodes)
     return {"trial": int(state.trial), "episodes": episodes, **result, "fingerprint": checkpoint.fingerprint(state)}
 
 

@@ -12,7 +12,8 @@ import numpy as np
 
 from pegasus_jax import settings
 from pegasus_jax.build import build
-from pegasus_jax.config import Config, SettingError, nearest
+from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.config import Config
 from pegasus_jax.record import RunError, about
 from pegasus_jax.report.curves import areas_picture, picture
 from pegasus_jax.report.figures import Figure

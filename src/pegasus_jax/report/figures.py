@@ -23,7 +23,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax.config import SettingError, nearest
+from pegasus_jax.checks import SettingError, nearest
 
 
 class Claim(NamedTuple):
