@@ -1,5 +1,7 @@
 """The mechanism's GPU kernel, interpreted, against the plain form: values and gradients. And that it compiles."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,9 +56,11 @@ def test_as_the_plain_form(case: dict, noise: dropout.Dropout, substeps: int) ->
     plain, fused, *arguments = pieces(case, noise, substeps)
     weight = jax.random.normal(jax.random.key(3), (K, case["states"]))
 
-    def both(change: object) -> tuple:
+    by = (0, 1, 2, 3) if case is RELU else (2, 3)  # by belief and masks it is the plain form's: once is enough
+
+    def both(change: Callable) -> tuple:
         value = lambda *given: jnp.sum(weight * change(*given))  # noqa: E731
-        return jax.jit(change)(*arguments), jax.jit(jax.grad(value, (0, 1, 2, 3), allow_int=True))(*arguments)
+        return jax.jit(change)(*arguments), jax.jit(jax.grad(value, by, allow_int=True))(*arguments)
 
     expected, gradients = both(plain)
     got, ours = both(fused[True])
@@ -64,6 +68,26 @@ def test_as_the_plain_form(case: dict, noise: dropout.Dropout, substeps: int) ->
     for mine, theirs in zip(jax.tree.leaves(ours), jax.tree.leaves(gradients), strict=True):
         if mine.dtype == jnp.float32:
             np.testing.assert_allclose(mine, theirs, rtol=2e-4, atol=2e-5 * (1 + float(jnp.max(jnp.abs(theirs)))))
+
+
+def test_a_model_takes_it_where_there_is_one_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    _, _, belief, masks, x, u = pieces(RELU, dropout.none(), 1)
+    model = lagrangian(**RELU, dropout=dropout.none(), dt=0.1, substeps=1, head=HEADS["sigmoid"])
+    assert model.particles is not None
+    expected, calls = jax.vmap(model.apply, (None, 0, 0, 0))(belief, masks, x, u), []
+
+    def fused(*arguments: object, **mechanics: object) -> object:
+        calls.append(mechanics)
+        return interpreted(*arguments, **mechanics, interpret=True)
+
+    interpreted = kernel.fused
+    monkeypatch.setattr(kernel, "fused", fused)
+    for there in (False, True):
+        monkeypatch.setattr("pegasus_jax.dynamics.lagrangian.alone_on_gpu", lambda x, there=there: there)
+        got = model.particles(belief, masks, x, u)
+        np.testing.assert_allclose(got.mean, expected.mean, rtol=2e-5, atol=2e-5)
+        np.testing.assert_allclose(got.std, expected.std, rtol=1e-6)
+        assert len(calls) == there
 
 
 @pytest.mark.parametrize(("case", "noise", "substeps"), CASES)

@@ -148,6 +148,14 @@ def test_a_particle_holds_its_draws_for_the_whole_trajectory():
     assert np.array_equal(imagined.x[0], CONSTANT.start)
 
 
+def test_a_model_of_all_particles_at_once_is_taken_for_the_model_of_one():
+    one = model(lambda belief, draw, x, u: Prediction(draw, jnp.zeros(2)))
+    many = one._replace(particles=lambda belief, draws, x, u: Prediction(draws[::-1], jnp.zeros((3, 2))))
+    pieces = dict(policy=controller(lambda params, noise, x: noise[None]), match=moments.keep)
+    steps = [np.diff(rollout(None, None, CONSTANT, dynamics=d, **pieces).x, axis=0) for d in (one, many)]
+    np.testing.assert_allclose(steps[0], steps[1][:, ::-1], atol=1e-5)
+
+
 @given(*[st.floats(0, 2, width=32)] * 3)
 def test_noise_factors_do_what_they_say(policy_factor, state_factor, cost_factor):
     """The controller repeats what it sees, the model stands still: each factor can be read off."""
