@@ -84,10 +84,12 @@ def test_a_model_takes_it_where_there_is_one_gpu(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(kernel, "fused", fused)
     for there in (False, True):
         monkeypatch.setattr("pegasus_jax.dynamics.lagrangian.alone_on_gpu", lambda x, there=there: there)
-        got = model.particles(belief, masks, x, u)
+        got = model.particles(model.apply)(belief, masks, x, u)
         np.testing.assert_allclose(got.mean, expected.mean, rtol=2e-5, atol=2e-5)
         np.testing.assert_allclose(got.std, expected.std, rtol=1e-6)
         assert len(calls) == there
+    own = model.particles(lambda belief, masks, x, u: u)  # a model that somebody changed
+    np.testing.assert_array_equal(own(belief, masks, x, u), u)
 
 
 @pytest.mark.parametrize(("case", "noise", "substeps"), CASES)

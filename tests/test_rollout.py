@@ -150,7 +150,7 @@ def test_a_particle_holds_its_draws_for_the_whole_trajectory():
 
 def test_a_model_of_all_particles_at_once_is_taken_for_the_model_of_one():
     one = model(lambda belief, draw, x, u: Prediction(draw, jnp.zeros(2)))
-    many = one._replace(particles=lambda belief, draws, x, u: Prediction(draws[::-1], jnp.zeros((3, 2))))
+    many = one._replace(particles=lambda apply: lambda belief, draws, x, u: Prediction(draws[::-1], jnp.zeros((3, 2))))
     pieces = dict(policy=controller(lambda params, noise, x: noise[None]), match=moments.keep)
     steps = [np.diff(rollout(None, None, CONSTANT, dynamics=d, **pieces).x, axis=0) for d in (one, many)]
     np.testing.assert_allclose(steps[0], steps[1][:, ::-1], atol=1e-5)

@@ -1,6 +1,7 @@
 """K imagined trajectories as a deterministic function of policy, belief and scenarios. No keys here."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -38,7 +39,8 @@ def rollout(
     back through a particle's state that is longer than that.
     """
     act = jax.vmap(policy.apply, (None, 0, 0))
-    predict = dynamics.particles or jax.vmap(dynamics.apply, (None, 0, 0, 0))
+    many = dynamics.particles or partial(jax.vmap, in_axes=(None, 0, 0, 0))
+    predict = many(dynamics.apply)
 
     def step(carry: tuple[Array, Array], draws: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple]:
         x, seeing = carry

@@ -101,8 +101,8 @@ class Dynamics(NamedTuple):
     apply: Callable[[Any, Params, Array, Array], Prediction]  # (belief, draw, x [D], u [U])
     # (belief, mean [F + U], cov of (encoded state, control)) -> gaussian.Image of the change of state; None: not known
     moments: Callable[[Any, Array, Array], Any] | None = None
-    # `apply` of K particles at once, (belief, draws [K, ...], x [K, D], u [K, U]); None: `apply`, vmapped
-    particles: Callable[[Any, Params, Array, Array], Prediction] | None = None
+    # apply -> the same of K particles at once, (belief, draws [K, ...], x [K, D], u [K, U]); None: vmapped
+    particles: Callable[[Callable[..., Prediction]], Callable[..., Prediction]] | None = None
 
 
 class Policy(NamedTuple):

@@ -1,5 +1,6 @@
 """A mechanism whose energies are a Bayesian network: Lagrange's equations, integrated (after Lutter et al. 2019)."""
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -145,19 +146,23 @@ def lagrangian(
         change = jnp.zeros_like(x).at[coordinates].set(now[0] - start[0]).at[moving].set(now[1] - start[1])
         return Prediction(change, head(belief.params["raw_std"]) * units.change)
 
-    each = jax.vmap(predict, (None, 0, 0, 0))
     mechanics = dict(turning=turning, dt=dt, substeps=substeps, activation=activation)
 
-    def particles(belief: Belief, masks: Masks, x: Array, u: Array) -> Prediction:
-        if not alone_on_gpu(x):
-            return each(belief, masks, x, u)
-        from pegasus_jax import mechanics_kernel as kernel  # what it needs of JAX is for GPUs
+    def particles(apply: Callable[..., Prediction]) -> Callable[..., Prediction]:
+        each = jax.vmap(apply, (None, 0, 0, 0))
 
-        if not kernel.suits(hidden, n):
-            return each(belief, masks, x, u)
-        order = np.concatenate([coordinates, moving])
-        change = kernel.fused(lambda *arguments: each(*arguments).mean, order, **mechanics)(belief, masks, x, u)
-        return Prediction(change, jnp.broadcast_to(head(belief.params["raw_std"]) * belief.units.change, x.shape))
+        def together(belief: Belief, masks: Masks, x: Array, u: Array) -> Prediction:
+            if apply is not predict or not alone_on_gpu(x):
+                return each(belief, masks, x, u)
+            from pegasus_jax import mechanics_kernel as kernel  # what it needs of JAX is for GPUs
+
+            if not kernel.suits(hidden, n):
+                return each(belief, masks, x, u)
+            order = np.concatenate([coordinates, moving])
+            change = kernel.fused(lambda *arguments: each(*arguments).mean, order, **mechanics)(belief, masks, x, u)
+            return Prediction(change, jnp.broadcast_to(head(belief.params["raw_std"]) * belief.units.change, x.shape))
+
+        return together
 
     def loss(params: Params, key: Key, batch: Batch, units: Units) -> Array:
         """Eq. 2 / N, but of Student's t, with fresh noise for every row; the constants have the weights' prior."""
