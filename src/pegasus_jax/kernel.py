@@ -141,7 +141,7 @@ def precise(dynamics: Dynamics) -> Dynamics:
 
         return call
 
-    return Dynamics(*(exact(function) for function in dynamics))
+    return dynamics._replace(**{name: exact(function) for name, function in dynamics._asdict().items() if function})
 
 
 def in_raw_units(process: gaussian.Map, scaling: Scaling) -> gaussian.Map:
