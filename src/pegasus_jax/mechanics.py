@@ -61,13 +61,7 @@ def acceleration(m: Mechanism, masks: Sequence[Any], q: State, v: State, u: Stat
         f += sum(sum(by[a, i, j] * v[i] for i in range(j, n)) * momentum[j] for j in range(n))
         f -= sum(change[a, j] * momentum[j] + lower[a, j] * moved[j] for j in range(a + 1))
         force.append(f)
-    half: list[Array] = []
-    for i in range(n):
-        half.append((force[i] - sum(lower[i, j] * half[j] for j in range(i))) / lower[i, i])
-    whole: dict[int, Array] = {}
-    for i in reversed(range(n)):
-        whole[i] = (half[i] - sum(lower[j, i] * whole[j] for j in range(i + 1, n))) / lower[i, i]
-    return tuple(within(whole[i], GREATEST_CHANGE)[0] for i in range(n))
+    return tuple(within(a, GREATEST_CHANGE)[0] for a in substituted(lower, force))
 
 
 def energies(
@@ -109,6 +103,16 @@ def energies(
         y, slopes = active(mask, product(y, kernel) + bias, [product(slope, kernel) for slope in slopes])
     out = [jnp.sum(y * row, 1) + bias for row, bias in zip(m.kernels[-1], m.biases[-1], strict=True)]
     return out, [[jnp.sum(slope * row, 1) for slope in slopes] for row in m.kernels[-1]]
+
+
+def substituted(lower: Any, force: Any) -> list[Array]:
+    """a [n] with L L' a = force [n], entry by entry; lower[i, j] are those of L."""
+    n, half, whole = len(force), [], {}
+    for i in range(n):
+        half.append((force[i] - sum(lower[i, j] * half[j] for j in range(i))) / lower[i, i])
+    for i in reversed(range(n)):
+        whole[i] = (half[i] - sum(lower[j, i] * whole[j] for j in range(i + 1, n))) / lower[i, i]
+    return [whole[i] for i in range(n)]
 
 
 def softplus(z: Array) -> Array:

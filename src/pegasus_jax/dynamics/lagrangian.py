@@ -9,7 +9,7 @@ import jax.scipy.stats
 import numpy as np
 
 from pegasus_jax.angles import encode
-from pegasus_jax.mechanics import GREATEST_CHANGE, GREATEST_SPEED, LEAST_MASS
+from pegasus_jax.mechanics import GREATEST_CHANGE, GREATEST_SPEED, LEAST_MASS, substituted
 from pegasus_jax.noisy import Head, Masks, noisy
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 from pegasus_jax.whiten import whitener
@@ -196,18 +196,11 @@ def within(v: Array, limit: Array | float) -> Array:
 
 def solve(lower: Array, force: Array) -> Array:
     """a [n] with L L' a = force; unrolled, because for a few coordinates a library call costs more than the network."""
-    n = force.shape[0]
 
     def product(a: Array) -> Array:
         return jnp.sum(lower * jnp.sum(lower * a[:, None], 0), 1)
 
     def substitute(_: Any, force: Array) -> Array:
-        half: list[Array] = []
-        for i in range(n):
-            half.append((force[i] - sum(lower[i, j] * half[j] for j in range(i))) / lower[i, i])
-        whole: dict[int, Array] = {}
-        for i in reversed(range(n)):
-            whole[i] = (half[i] - sum(lower[j, i] * whole[j] for j in range(i + 1, n))) / lower[i, i]
-        return jnp.stack([whole[i] for i in range(n)])
+        return jnp.stack(substituted(lower, force))
 
     return jax.lax.custom_linear_solve(product, force, substitute, symmetric=True)
