@@ -155,18 +155,31 @@ def test_a_limit_reaches_the_gradient_as_a_share_of_each_particle():
     np.testing.assert_allclose(same.gradient_norm[0], plain.gradient_norm[0], rtol=1e-5)
 
 
-def test_a_limit_that_is_loosened_must_be_there():
-    with pytest.raises(SettingError, match=r"search.loosen=30 needs a limit to loosen: search.limit=1"):
-        config.Search(loosen=30)
+@pytest.mark.parametrize(
+    ("search", "message"),
+    [
+        (dict(reheat=0.3, decay=0.1), "search.reheat=0.3 needs searches that cool: search.anneal=10"),
+        (dict(reheat=0.3, anneal=10), "search.reheat=0.3 needs searches that cool: search.anneal=10"),
+        (dict(loosen=30, limit=1.0), "search.loosen=30 needs search.limit=1 search.reheat=0.3"),
+        (dict(loosen=30, reheat=0.3, anneal=10, decay=0.1), "search.loosen=30 needs search.limit=1 search.reheat=0.3"),
+    ],
+)
+def test_only_what_is_annealed_is_reheated_and_only_a_limit_loosened(search, message):
+    with pytest.raises(SettingError, match=message):
+        config.Search(**search)
 
 
-def test_a_limit_is_loosened_over_the_search():
-    """The same scenarios and all but the same policy twice; the second time the limit is a million times as long."""
-    still = dict(steps=2, learning_rate=1e-9, period=Period(0, 0, 0, 0, 0))
-    (_, state, run), (_, _, loosened) = searcher(**still), searcher(**still, limit=1e-3, loosen=1e12)
-    plain, norm = (f(state)[1].gradient_norm for f in (run, loosened))
-    assert norm[0] < 0.9 * plain[0]
-    np.testing.assert_allclose(norm[1], plain[1], rtol=1e-5)
+def test_after_the_annealed_searches_each_is_reheated_and_its_limit_loosened():
+    """Trials 2, 3 and 4 under the same scenarios: 1 and 2 are annealed, to a step of nothing; one step each."""
+    course = dict(steps=1, learning_rate=1e-4, decay=0.0, anneal=2, period=Period(0, 0, 0, 0, 0))
+    _, state, run = searcher(**course, limit=1e-3, reheat=0.3, loosen=1e9)
+    _, _, plain = searcher(**course)
+    at = [state._replace(trial=jnp.int32(trial)) for trial in (2, 3, 4)]
+    moved = [np.max(np.abs(run(before)[0].policy.params - before.policy.params)) for before in at]
+    np.testing.assert_allclose(moved, [0.5e-4, 0.3e-4, 0.3e-4], rtol=0.01)
+    norms = [[float(f(before)[1].gradient_norm[0]) for f in (run, plain)] for before in at]
+    assert norms[0][0] < 0.9 * norms[0][1]
+    np.testing.assert_allclose([of[0] for of in norms[1:]], [of[1] for of in norms[1:]], rtol=1e-5)
 
 
 def test_a_step_size_falls_as_half_a_cosine_and_begins_again():

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from pegasus_jax import cost, moments, scenarios
-from pegasus_jax.course import Course, loosening, narrowing, pace
+from pegasus_jax.course import Course, narrowing, pace, reheated
 from pegasus_jax.fit import guarded
 from pegasus_jax.rollout import NoiseUse
 from pegasus_jax.search import keeping_best, objective, optimise, remembering
@@ -238,7 +238,11 @@ def test_the_search_is_gradient_descent_on_the_scenarios_of_each_iteration():
 
 def test_the_width_narrows_geometrically_and_stays():
     np.testing.assert_allclose(jax.vmap(narrowing(4.0, 10))(jnp.arange(0, 25, 5)), [4, 2, 1, 1, 1], rtol=1e-6)
-    np.testing.assert_allclose(jax.vmap(loosening(9.0, 10))(jnp.arange(0, 25, 5)), [1, 3, 9, 9, 9], rtol=1e-6)
+
+
+def test_after_a_course_every_search_has_its_own():
+    factor = jax.vmap(reheated(lambda i: -1.0 * i, 4, 2, top=0.4, decay=0.5))(jnp.arange(9))
+    np.testing.assert_allclose(factor, [0, -1, -2, -3, 0.4, 0.3, 0.4, 0.3, 0.4], atol=1e-6)
 
 
 def test_the_pace_falls_and_begins_again_where_a_search_refines():

@@ -13,7 +13,7 @@ from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco
 from pegasus_jax import config as settings
 from pegasus_jax.checks import SettingError
 from pegasus_jax.cost import of_particles
-from pegasus_jax.course import Course, either, loosening, narrowing, pace
+from pegasus_jax.course import Course, either, narrowing, pace, reheated
 from pegasus_jax.dynamics.bnn import bnn
 from pegasus_jax.dynamics.ensemble import ensemble
 from pegasus_jax.dynamics.gp import gp
@@ -152,13 +152,15 @@ def search_of(
     steps = search.anneal * search.steps
     narrow = (steps if refine is None else refine) / 2 if search.widen > 1 else 0
     width = narrowing(search.widen, narrow) if narrow else None
-    loose = loosening(search.loosen, steps) if search.loosen > 1 else None
+    step = pace(steps, search.decay, refine)
+    if step is not None and search.reheat:
+        step = reheated(step, steps, search.steps, search.reheat, search.decay)
 
     def value(params: Params, belief: Params, given: Scenarios, iteration: Array) -> Array:
         refining = None if refine is None else iteration >= refine
         cost = costs(refining, width and width(iteration))
         onwards = either(refining, moments.keep, match)
-        longest = limit * loose(iteration) if limit and loose else limit
+        longest = limit * jnp.where(iteration < steps, 1, search.loosen) if limit and search.reheat else limit
         return objective(params, belief, given, **pieces, **ends, limit=longest, match=onwards, cost=cost)
 
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
@@ -170,7 +172,7 @@ def search_of(
         period=Period(**vars(search.period)),
         course=Course(
             stage=jnp.asarray,
-            pace=pace(steps, search.decay, refine),
+            pace=step,
             settled=narrow if refine is None else refine,
             refine=refine,
         ),

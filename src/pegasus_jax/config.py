@@ -236,7 +236,8 @@ class Search:
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
     limit: float | None = setting(None, "a particle's gradient by its state that is longer is dropped; null: none is")
-    loosen: float = setting(1.0, "the limit at the end of a search, or of `anneal` trials' searches, as a factor")
+    reheat: float = setting(0.0, "step size of each search after `anneal`, which falls again, as a fraction; 0: none")
+    loosen: float = setting(1.0, "factor of the limit in the searches that are reheated")
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
@@ -254,6 +255,7 @@ class Search:
         checks.least("search", self, 2, "particles")
         checks.within("search.learning_rate", self.learning_rate, 0, open_low=True)
         checks.within("search.decay", self.decay, 0, 1)
+        checks.within("search.reheat", self.reheat, 0, 1)
         for name, choices in (("aggregate", AGGREGATES), ("cost", COSTS), ("sensors", SENSORS)):
             checks.choice(f"search.{name}", getattr(self, name), choices)
         checks.within("search.discount", self.discount, 0, 1, open_low=True)
@@ -266,8 +268,12 @@ class Search:
         for name, value in (("clip", self.clip), ("limit", self.limit)):
             if value is not None:
                 checks.within(f"search.{name}", value, 0, open_low=True)
-        if self.loosen > 1 and self.limit is None:
-            raise SettingError(f"search.loosen={self.loosen:g} needs a limit to loosen: search.limit=1")
+        if self.reheat and (self.anneal == 1 or self.decay == 1):
+            raise SettingError(
+                f"search.reheat={self.reheat:g} needs searches that cool: search.anneal=10 search.decay=0.1"
+            )
+        if self.loosen > 1 and (self.limit is None or not self.reheat):
+            raise SettingError(f"search.loosen={self.loosen:g} needs search.limit=1 search.reheat=0.3, or the like")
         if self.anneal > 1 and (self.refine or self.best):
             raise SettingError(f"search.anneal={self.anneal} needs search.refine=0 search.best=false")
         if self.starts > 1 and not self.reset:

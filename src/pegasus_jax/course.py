@@ -31,11 +31,6 @@ def narrowing(widest: float, over: float) -> Schedule:
     return lambda i: widest ** jnp.maximum(0.0, 1 - i / over)
 
 
-def loosening(most: float, over: float) -> Schedule:
-    """A factor that rises from 1 at iteration 0 to `most` at iteration `over`, geometrically."""
-    return lambda i: most ** jnp.minimum(1.0, i / over)
-
-
 def pace(steps: int, decay: float, refine: int | None = None) -> Schedule | None:
     """A factor of the step size: in `steps` it falls from 1 to `decay`, as half a cosine; None if it is always 1.
 
@@ -47,6 +42,12 @@ def pace(steps: int, decay: float, refine: int | None = None) -> Schedule | None
     fall = optax.cosine_decay_schedule(1.0, max(refine, 1), decay)
     again = optax.cosine_decay_schedule(1.0, max(steps - refine, 1), 0.03)
     return lambda i: jnp.where(i < refine, fall(i), again(i - refine))
+
+
+def reheated(annealed: Schedule, over: int, steps: int, top: float, decay: float) -> Schedule:
+    """`annealed` before iteration `over`; then in each search of `steps` half a cosine, from `top` to `decay` of it."""
+    fall = optax.cosine_decay_schedule(top, steps, decay)
+    return lambda i: jnp.where(i < over, annealed(i), fall((i - over) % steps))
 
 
 def either(condition: Array | None, yes: Callable[..., Array], no: Callable[..., Array]) -> Callable[..., Array]:
