@@ -166,9 +166,11 @@ def _train(words: Sequence[str]) -> None:
             raise SettingError(f"out={home} holds runs already; resume={home} goes on, out={record.free(home)} is free")
         for run in runs.values():
             record.create(run)
+    from pegasus_jax.compiled import shelf
     from pegasus_jax.train import train_seeds
 
-    train_seeds(config, runs, resume="resume" in options, command=command, mesh=over)
+    kept = shelf(replace(config, seed=0), seeds=len(runs))
+    train_seeds(config, runs, resume="resume" in options, command=command, mesh=over, shelf=kept)
     if leads():
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -14,6 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
 from pegasus_jax import mesh
+from pegasus_jax.compiled import load, save
 from pegasus_jax.record import processors
 from pegasus_jax.types import Experiment
 
@@ -28,9 +30,10 @@ LONG = ("fit", "search")
 class Jitted:
     """A jitted function that says how long its caller waited for compiling; compiles once, or it is a defect."""
 
-    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+    def __init__(self, function: Callable[..., Any], kept: Path | None = None, **options: Any) -> None:
         self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
         self.coming: Future | None = None
+        self.kept = kept  # where it is on disk
 
     def __call__(self, *arguments: Any) -> Any:
         if self.compiled is None:
@@ -40,14 +43,20 @@ class Jitted:
         return jax.block_until_ready(self.compiled(*arguments))
 
     def compile(self, *arguments: Any) -> Any:
-        """The function compiled for arguments of these shapes."""
-        return self.function.lower(*arguments).compile()
+        """The function compiled for arguments of these shapes, now or by an earlier command."""
+        program = None if self.kept is None else load(self.kept, arguments)
+        if program is None:
+            program = self.function.lower(*arguments).compile()
+            if self.kept is not None:
+                save(self.kept, program)
+        return program
 
 
 class Program:
     """An experiment over S seeds: every argument and result has a leading axis [S], except those that all share.
 
-    With a mesh, the seeds lie on its devices; those of several processes call every part together.
+    With a mesh, the seeds lie on its devices; those of several processes call every part together. With a `shelf`, a
+    folder that is this experiment's alone (`compiled.shelf`), its programs are kept there.
     """
 
     def __init__(
@@ -57,6 +66,7 @@ class Program:
         seeds: int = 1,
         over: Mesh | None = None,
         side_by_side: bool | None = None,
+        shelf: Path | None = None,
     ) -> None:
         self.mesh, self.seeds = over, seeds
         # Evaluation episodes. A GPU takes as long for one as for twenty; a processor does not, and would have one
@@ -78,7 +88,12 @@ class Program:
         layout = {} if over is None else {"out_shardings": mesh.over_seeds(over)}
         quick = {"compiler_options": BRIEFLY} if jax.default_backend() == "cpu" else {}
         self.parts = {
-            name: Jitted(over_seeds(function, axes, seeds=seeds), **layout, **({} if name in LONG else quick))
+            name: Jitted(
+                over_seeds(function, axes, seeds=seeds),
+                kept=None if shelf is None else shelf / name,
+                **layout,
+                **({} if name in LONG else quick),
+            )
             for name, (function, axes) in functions.items()
         }
         self.spent: dict[str, float] = {}

@@ -48,14 +48,20 @@ def train(config: Config, run: Path, *, resume: bool = False, command: str = "")
 
 
 def train_seeds(
-    config: Config, runs: dict[int, Path], *, resume: bool = False, command: str = "", mesh: Mesh | None = None
+    config: Config,
+    runs: dict[int, Path],
+    *,
+    resume: bool = False,
+    command: str = "",
+    mesh: Mesh | None = None,
+    shelf: Path | None = None,
 ) -> RunState:
     """`train` for the seeds and folders of `runs`, all as one program; returns their states [S, ...].
 
     Each folder is what a run of that seed alone would leave, and can be resumed alone. The seeds share nothing but the
     clock: one that diverges leaves the others as they are. All go on from the newest trial that all have finished.
     With a `mesh` (mesh.py) of several devices the seeds are shared out among them; where several processes hold the
-    devices, all call this together, see the same files, and the first one writes.
+    devices, all call this together, see the same files, and the first one writes. `shelf` is as for `Program`.
     """
     folders, seeds = list(runs.values()), list(runs)
     with ExitStack() as held:
@@ -66,7 +72,7 @@ def train_seeds(
             raise SettingError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
         set_precision(config)
         experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
-        program = Program(experiment, config.search.steps, len(seeds), mesh)
+        program = Program(experiment, config.search.steps, len(seeds), mesh, shelf=shelf)
         display = Display(config.trials, 0, quiet=not leads())
         states = together(folders, replace(before, seed=0), display) if resume else None
         done = display.done = 0 if states is None else int(states.trial[0])
