@@ -157,19 +157,22 @@ def _train(words: Sequence[str]) -> None:
     if not {"mesh", "distributed", "coordinator"} & {*options}:
         share_processors(len(runs))
     over = _mesh(options.get("mesh"), len(runs))
+    import jax
+
     from pegasus_jax.build import build, set_precision
+    from pegasus_jax.compiled import shelf
 
     set_precision(config)
+    if kept := shelf(replace(config, seed=0), seeds=len(runs)):
+        jax.config.update("jax_enable_compilation_cache", False)  # what is kept there replaces it
     build(replace(config, seed=0), over)  # so that impossible settings end here, before anything is written
     if "resume" not in options and leads():
         if record.seeds_of(home):
             raise SettingError(f"out={home} holds runs already; resume={home} goes on, out={record.free(home)} is free")
         for run in runs.values():
             record.create(run)
-    from pegasus_jax.compiled import shelf
     from pegasus_jax.train import train_seeds
 
-    kept = shelf(replace(config, seed=0), seeds=len(runs))
     train_seeds(config, runs, resume="resume" in options, command=command, mesh=over, shelf=kept)
     if leads():
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")

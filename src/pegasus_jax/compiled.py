@@ -1,9 +1,9 @@
 """Compiled programs of earlier commands, on disk: the same command given again traces nothing.
 
 JAX's own cache saves the compiling of a program, and to look there the program must have been traced and lowered: a
-third of the seconds before a first search. Here an executable lies under what it is made of instead: the settings, the
-sources of these packages, versions, flags, processor. Only the command line asks, because in another's process any
-function of ours may have been replaced.
+third of the seconds before a first search. Here an executable lies under a digest of its lowered program, and that
+digest under what the program is made of: the settings, the sources of these packages, versions, flags, processor. Only
+the command line asks, because in another's process any function of ours may have been replaced.
 """
 
 import gzip
@@ -12,7 +12,6 @@ import json
 import os
 import pickle
 import platform
-import shutil
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -20,18 +19,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
-from jax.stages import Compiled
+from jax.stages import Compiled, Wrapped
 
 from pegasus_jax import record, settings
 from pegasus_jax.config import Config
 from pegasus_jax.tasks import TASKS
 
 PACKAGES = ("pegasus_jax", "pegasus_envs")  # whose sources the programs are made of
-KEPT = 20  # shelves, the last that were used; one of the cart-pole has 3 MB
+KEPT = 400  # files, the last that were used; the cart-pole's programs are 16 of them, 3 MB
 
 
 def shelf(config: Config, **shape: Any) -> Path | None:
-    """The folder for the programs of a config and their `shape`, in JAX's cache folder.
+    """Where the programs of a config and their `shape` are, in JAX's cache folder: what their files' names begin with.
 
     None where they cannot be told from others, or not be read: tasks made of the user's files, several devices,
     anything but a processor, and where JAX keeps no cache.
@@ -40,13 +39,20 @@ def shelf(config: Config, **shape: Any) -> Path | None:
     known = config.task in TASKS and jax.default_backend() == "cpu" and jax.device_count() == 1
     if not known or not cache or "://" in cache:
         return None
-    origin = [settings.plain(config), shape, jax.config.values, os.environ.get("XLA_FLAGS"), record.about("")]
-    digest = hashlib.sha256(json.dumps([*origin, processor()], sort_keys=True, default=str).encode())
+    digest = hashlib.sha256(json.dumps([settings.plain(config), shape], sort_keys=True, default=str).encode())
+    digest.update(surroundings())
     for package in PACKAGES:
         home = Path(str(resources.files(package)))
         for path in sorted(path for path in home.rglob("*") if path.suffix in (".py", ".xml")):
             digest.update(f"{path.relative_to(home)}\n".encode() + path.read_bytes())
     return Path(cache) / "programs" / digest.hexdigest()[:32]
+
+
+def surroundings() -> bytes:
+    """What one lowered program may become different executables by."""
+    about = {key: value for key, value in record.about("").items() if key != "command"}
+    known = [jax.config.values, os.environ.get("XLA_FLAGS"), about, processor()]
+    return json.dumps(known, sort_keys=True, default=str).encode()
 
 
 def processor() -> str:
@@ -58,30 +64,66 @@ def processor() -> str:
     return "\n".join(line for line in lines if line.startswith(("model name", "flags", "Features")))
 
 
-def load(path: Path, arguments: tuple) -> Compiled | None:
-    """The program at `path`, if there is one that can be read and takes such arguments."""
+def program(path: Path, function: Wrapped, arguments: tuple, options: dict[str, Any]) -> Compiled:
+    """The function, jitted with these options, compiled for such arguments.
+
+    That is the executable that `path` names, or the one that the same lowered program has become before, or a new one;
+    `path` names it from then on. JAX's cache must be off: an executable that was read from there cannot be written.
+    """
     try:
-        executable, in_tree, out_tree = pickle.loads(gzip.decompress(path.read_bytes()))
+        named = path.with_name(path.read_text())
+    except (OSError, ValueError):  # a name cut short is none
+        named = None
+    if named and (found := read(named, arguments)):
+        touch(path)
+        return found
+    lowered = function.lower(*arguments)
+    what = [lowered.as_text(), str(lowered.in_tree), str(lowered.out_tree), str(options)]
+    named = path.with_name(hashlib.sha256("\n".join(what).encode() + surroundings()).hexdigest())
+    found = read(named, arguments)
+    if found is None:
+        found = lowered.compile()
+        write(named, found)
+    keep(path, named.name.encode())
+    return found
+
+
+def read(path: Path, arguments: tuple) -> Compiled | None:
+    """The executable at `path`, if there is one that can be read and takes such arguments."""
+    try:
+        executable, *trees = pickle.loads(gzip.decompress(path.read_bytes()))
         _find_lapack()
-        program = serialize_executable.deserialize_and_load(
-            executable, in_tree, out_tree, execution_devices=jax.devices()[:1]
-        )
+        found = serialize_executable.deserialize_and_load(executable, *trees, execution_devices=jax.devices()[:1])
     except Exception:  # of another version, cut short: whatever it is, the program can be compiled
         return None
-    os.utime(path.parent)  # used now
-    return program if _shapes(program.args_info[0]) == _shapes(arguments) else None
+    touch(path)
+    return found if _shapes(found.args_info[0]) == _shapes(arguments) else None
 
 
-def save(path: Path, program: Compiled) -> None:
-    """Keep a program at `path`, and of all shelves the last `KEPT`. What cannot be kept is not."""
+def write(path: Path, found: Compiled) -> None:
+    """Keep an executable at `path`. What JAX cannot write is not kept."""
     try:
-        content = gzip.compress(pickle.dumps(serialize_executable.serialize(program)), 1)
-        record.write_whole(path, lambda file: file.write(content))
-        shelves = sorted(path.parent.parent.iterdir(), key=lambda folder: folder.stat().st_mtime)
-        for old in shelves[:-KEPT]:
-            shutil.rmtree(old, ignore_errors=True)
-    except (OSError, NotImplementedError, ValueError):  # a full disk; a program that JAX cannot write
+        content = serialize_executable.serialize(found)
+    except (NotImplementedError, ValueError):
         return
+    keep(path, gzip.compress(pickle.dumps(content), 1))
+
+
+def keep(path: Path, content: bytes) -> None:
+    """Write a file, and of all the last `KEPT` stay; on a full disk, none is written."""
+    try:
+        record.write_whole(path, lambda file: file.write(content))
+        files = sorted(path.parent.iterdir(), key=lambda file: file.stat().st_mtime)
+        for old in files[:-KEPT]:
+            old.unlink()
+    except OSError:  # or another process was quicker
+        return
+
+
+def touch(path: Path) -> None:
+    """Used now, if it is still there."""
+    if path.exists():
+        path.touch()
 
 
 def _find_lapack() -> None:

@@ -15,7 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
 from pegasus_jax import mesh
-from pegasus_jax.compiled import load, save
+from pegasus_jax.compiled import program
 from pegasus_jax.record import processors
 from pegasus_jax.types import Experiment
 
@@ -33,7 +33,7 @@ class Jitted:
     def __init__(self, function: Callable[..., Any], kept: Path | None = None, **options: Any) -> None:
         self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
         self.coming: Future | None = None
-        self.kept = kept  # where it is on disk
+        self.kept, self.options = kept, options  # where it is on disk, and how it was made
 
     def __call__(self, *arguments: Any) -> Any:
         if self.compiled is None:
@@ -44,19 +44,16 @@ class Jitted:
 
     def compile(self, *arguments: Any) -> Any:
         """The function compiled for arguments of these shapes, now or by an earlier command."""
-        program = None if self.kept is None else load(self.kept, arguments)
-        if program is None:
-            program = self.function.lower(*arguments).compile()
-            if self.kept is not None:
-                save(self.kept, program)
-        return program
+        if self.kept is not None:
+            return program(self.kept, self.function, arguments, self.options)
+        return self.function.lower(*arguments).compile()
 
 
 class Program:
     """An experiment over S seeds: every argument and result has a leading axis [S], except those that all share.
 
-    With a mesh, the seeds lie on its devices; those of several processes call every part together. With a `shelf`, a
-    folder that is this experiment's alone (`compiled.shelf`), its programs are kept there.
+    With a mesh, the seeds lie on its devices; those of several processes call every part together. With a `shelf`,
+    which is this experiment's alone (`compiled.shelf`), its programs are kept there.
     """
 
     def __init__(
@@ -90,7 +87,7 @@ class Program:
         self.parts = {
             name: Jitted(
                 over_seeds(function, axes, seeds=seeds),
-                kept=None if shelf is None else shelf / name,
+                kept=shelf and shelf.with_name(f"{shelf.name}-{name}"),
                 **layout,
                 **({} if name in LONG else quick),
             )
