@@ -158,8 +158,8 @@ def test_a_limit_reaches_the_gradient_as_a_share_of_each_particle():
 @pytest.mark.parametrize(
     ("search", "message"),
     [
-        (dict(reheat=0.3, decay=0.1), "search.reheat=0.3 needs searches that cool: search.anneal=10"),
-        (dict(reheat=0.3, anneal=10), "search.reheat=0.3 needs searches that cool: search.anneal=10"),
+        (dict(reheat=0.3, decay=0.1), "search.reheat=0.3 needs searches that cool, search.anneal=10"),
+        (dict(reheat=0.3, anneal=10), "search.reheat=0.3 needs searches that cool, search.anneal=10"),
         (dict(loosen=30, limit=1.0), "search.loosen=30 needs search.limit=1 search.reheat=0.3"),
         (dict(loosen=30, reheat=0.3, anneal=10, decay=0.1), "search.loosen=30 needs search.limit=1 search.reheat=0.3"),
     ],

@@ -236,7 +236,9 @@ class Search:
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
     limit: float | None = setting(None, "a particle's gradient by its state that is longer is dropped; null: none is")
-    reheat: float = setting(0.0, "step size of each search after `anneal`, which falls again, as a fraction; 0: none")
+    reheat: float = setting(
+        0.0, "step size each search after `anneal` starts from and falls, as a fraction; 0: it stays"
+    )
     loosen: float = setting(1.0, "factor of the limit in the searches that are reheated")
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
@@ -270,10 +272,13 @@ class Search:
                 checks.within(f"search.{name}", value, 0, open_low=True)
         if self.reheat and (self.anneal == 1 or self.decay == 1):
             raise SettingError(
-                f"search.reheat={self.reheat:g} needs searches that cool: search.anneal=10 search.decay=0.1"
+                f"search.reheat={self.reheat:g} needs searches that cool, search.anneal=10 search.decay=0.1;"
+                " the nearest is 0"
             )
         if self.loosen > 1 and (self.limit is None or not self.reheat):
-            raise SettingError(f"search.loosen={self.loosen:g} needs search.limit=1 search.reheat=0.3, or the like")
+            raise SettingError(
+                f"search.loosen={self.loosen:g} needs search.limit=1 search.reheat=0.3, or the like; the nearest is 1"
+            )
         if self.anneal > 1 and (self.refine or self.best):
             raise SettingError(f"search.anneal={self.anneal} needs search.refine=0 search.best=false")
         if self.starts > 1 and not self.reset:
