@@ -1,0 +1,126 @@
+"""A run's config on disk: what is saved is loaded to the last bit, and a file that is no config says so."""
+
+from functools import partial
+
+import jax
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pegasus_jax import config, settings
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
+from pegasus_jax.tasks import TASKS
+from pegasus_jax.variants import ALGORITHMS
+from test_settings import parse
+
+positive = st.floats(1e-6, 1e3)
+whole = partial(st.integers, max_value=10**6)
+layers = st.lists(st.integers(1, 500), max_size=4).map(tuple)
+configs = st.builds(
+    Config,
+    task=st.sampled_from(sorted(TASKS)),
+    seed=st.integers(0, 2**32 - 1),
+    trials=st.integers(1, 10_000),
+    model=st.builds(
+        BNN,
+        low=st.floats(-20, -0.1),
+        high=st.floats(0, 3),
+        hidden=layers,
+        dropout=st.sampled_from(config.DROPOUTS),
+        rate=st.floats(0, 0.99),
+        input_noise=st.booleans(),
+        heteroscedastic=st.booleans(),
+        head=st.sampled_from(config.HEADS),
+        whitening=st.sampled_from(["full", "diagonal"]),
+        weight_decay=st.floats(0, 10),
+        initialiser=st.sampled_from(config.INITIALISERS),
+    ),
+    policy=st.builds(
+        MLP,
+        hidden=layers,
+        dropout=st.floats(0, 0.99),
+        squash=st.sampled_from(config.SQUASHES),
+        execution=st.sampled_from(config.EXECUTIONS),
+        output_scale=positive,
+        initialiser=st.sampled_from(config.INITIALISERS),
+    ),
+    fit=st.builds(Fit, steps=whole(1), batch=whole(1), learning_rate=positive, reset=st.booleans()),
+    search=st.builds(
+        Search,
+        steps=whole(1),
+        particles=whole(2),
+        learning_rate=positive,
+        clip=st.none() | positive,
+        match=st.booleans(),
+        balanced=st.booleans(),
+        aggregate=st.sampled_from(config.AGGREGATES),
+        discount=st.floats(0.01, 1),
+        reset=st.booleans(),
+        policy_noise=st.floats(0, 10),
+        state_noise=st.floats(0, 10),
+        cost_noise=st.floats(0, 10),
+        period=st.builds(Period, *[whole(0)] * 5),
+    ),
+    explore=st.builds(Explore, trials=whole(0), kind=st.sampled_from(config.EXPLORATIONS)),
+)
+
+
+@given(chosen=configs)
+def test_a_saved_config_is_loaded_to_the_last_bit(chosen, tmp_path_factory):
+    path = tmp_path_factory.mktemp("config") / "config.yaml"
+    settings.save(chosen, path)
+    assert settings.load(path) == chosen
+
+
+NO_CONFIGS = {
+    "prose": "no config",
+    "list": "[1, 2]",
+    "broken": "seed: [",
+    "unknown": "colour: red",
+    "wrong type": "seed: many",
+    "impossible": "trials: 0",
+    "nested": "policy.hidden: {a: 1}",
+    "empty": "",  # a machine that lost power while writing
+}
+
+
+@pytest.mark.parametrize("name", NO_CONFIGS)
+def test_a_file_that_is_no_config_says_so(name, tmp_path):
+    path = tmp_path / "config.yaml"
+    path.write_text(NO_CONFIGS[name], encoding="utf-8")
+    with pytest.raises(SettingError) as caught:
+        settings.load(path)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_missing_config_says_so(tmp_path):
+    with pytest.raises(SettingError, match=r"config\.yaml"):
+        settings.load(tmp_path / "config.yaml")
+
+
+def test_a_run_from_before_a_setting_existed_goes_on_with_its_default(tmp_path):
+    chosen = parse("search.steps=70", "seed=7")
+    settings.save(chosen, tmp_path / "config.yaml")
+    lines = (tmp_path / "config.yaml").read_text().splitlines()
+    older = [line for line in lines if "search.refine" not in line and "fit.decay" not in line]
+    assert len(older) == len(lines) - 2
+    (tmp_path / "config.yaml").write_text("\n".join(older), encoding="utf-8")
+    assert settings.load(tmp_path / "config.yaml") == chosen
+
+
+@pytest.mark.parametrize("algorithm", ALGORITHMS)
+def test_what_was_parsed_survives_the_file(algorithm, tmp_path):
+    chosen = parse(f"algorithm={algorithm}", "model=sparse", "policy=mlp", "policy.hidden=[3]", "seed=7")
+    settings.save(chosen, tmp_path / "config.yaml")
+    loaded = settings.load(tmp_path / "config.yaml")
+    assert loaded == chosen
+    assert hash(loaded) == hash(chosen)
+    assert jax.tree.leaves(settings.override(loaded, {"trials": 20}).trials) == [20]
+
+
+@pytest.mark.parametrize("ends", [(1.0, 5.0), (-20.0, -12.0)])
+def test_any_interval_survives_the_file(ends, tmp_path):
+    chosen = Config(model=BNN(low=ends[0], high=ends[1]))
+    settings.save(chosen, tmp_path / "config.yaml")
+    assert settings.load(tmp_path / "config.yaml") == chosen
