@@ -139,8 +139,12 @@ def test_a_command_given_again_traces_nothing_and_learns_the_same(tmp_path):
     for run in runs:
         done = call("train", *words, f"out={run}", cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache"))
         assert done.returncode == 0, done.stderr
-    parts = {path.name.partition("-")[2] for path in (tmp_path / "cache" / "pegasus_jax" / "programs").iterdir()}
-    assert {"init", "episode", "absorb", "fit", "search", "imagine"} <= parts
+    programs = tmp_path / "cache" / "pegasus_jax" / "programs"
+    files = {*programs.iterdir()}
+    assert {"init", "episode", "absorb", "fit", "search1", "imagine"} <= {file.name.partition("-")[2] for file in files}
+    done = call("evaluate", runs[0], "episodes=2", cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache"))
+    assert done.returncode == 0, done.stderr
+    assert {*programs.iterdir()} == files  # nor does what looks at the run
     assert fingerprint(runs[0]) == fingerprint(runs[1])
     waited = [json.loads((run / "trials.jsonl").read_text())["seconds"]["compile"] for run in runs]
     assert waited[1] < 0.5 * waited[0]

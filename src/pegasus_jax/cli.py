@@ -157,14 +157,9 @@ def _train(words: Sequence[str]) -> None:
     if not {"mesh", "distributed", "coordinator"} & {*options}:
         share_processors(len(runs))
     over = _mesh(options.get("mesh"), len(runs))
-    import jax
+    from pegasus_jax.build import build
 
-    from pegasus_jax.build import build, set_precision
-    from pegasus_jax.compiled import shelf
-
-    set_precision(config)
-    if kept := shelf(replace(config, seed=0), seeds=len(runs)):
-        jax.config.update("jax_enable_compilation_cache", False)  # what is kept there replaces it
+    kept = _shelf(config, len(runs))
     build(replace(config, seed=0), over)  # so that impossible settings end here, before anything is written
     if "resume" not in options and leads():
         if record.seeds_of(home):
@@ -176,6 +171,20 @@ def _train(words: Sequence[str]) -> None:
     train_seeds(config, runs, resume="resume" in options, command=command, mesh=over, shelf=kept)
     if leads():
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
+
+
+def _shelf(config: Config, seeds: int) -> Path | None:
+    """Where the programs of a config for so many seeds are kept; then JAX's own cache is switched off."""
+    import jax
+
+    from pegasus_jax.build import set_precision
+    from pegasus_jax.compiled import shelf
+
+    set_precision(config)
+    kept = shelf(replace(config, seed=0), seeds=seeds)
+    if kept is not None:
+        jax.config.update("jax_enable_compilation_cache", False)
+    return kept
 
 
 def _changeable(key: str) -> bool:
@@ -230,9 +239,10 @@ def _evaluate(words: Sequence[str]) -> None:
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     if rest["json"] not in ("true", "false"):
         raise SettingError(f"json={rest['json']} is neither true nor false")
+    from pegasus_jax import settings
     from pegasus_jax.train import evaluate_run
 
-    result = evaluate_run(run, episodes, seed)
+    result = evaluate_run(run, episodes, seed, _shelf(settings.load(run / "config.yaml"), 1))
     if rest["json"] == "true":
         print(json.dumps(result))
     else:

@@ -51,7 +51,10 @@ def shelf(config: Config, **shape: Any) -> Path | None:
 def surroundings() -> bytes:
     """What one lowered program may become different executables by."""
     about = {key: value for key, value in record.about("").items() if key != "command"}
-    known = [jax.config.values, os.environ.get("XLA_FLAGS"), about, processor()]
+    config = {
+        key: value for key, value in jax.config.values.items() if key != "jax_num_cpu_devices"
+    }  # `about` lists them
+    known = [config, os.environ.get("XLA_FLAGS"), about, processor()]
     return json.dumps(known, sort_keys=True, default=str).encode()
 
 

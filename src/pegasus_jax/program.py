@@ -87,7 +87,7 @@ class Program:
         self.parts = {
             name: Jitted(
                 over_seeds(function, axes, seeds=seeds),
-                kept=shelf and shelf.with_name(f"{shelf.name}-{name}"),
+                kept=shelf and shelf.with_name(f"{shelf.name}-{name}{self.chunk if name == 'search' else ''}"),
                 **layout,
                 **({} if name in LONG else quick),
             )

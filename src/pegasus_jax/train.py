@@ -274,10 +274,10 @@ def newest(run: Path) -> tuple[Config, Experiment, RunState]:
     return config, build(config), part(states, 0)
 
 
-def evaluate_run(run: Path, episodes: int, seed: int) -> dict[str, Any]:
-    """How the newest policy of a run does on its plant, and the run's fingerprint."""
+def evaluate_run(run: Path, episodes: int, seed: int, shelf: Path | None = None) -> dict[str, Any]:
+    """How the newest policy of a run does on its plant, and the run's fingerprint. `shelf` is as for `Program`."""
     _, experiment, state = newest(run)
-    program = Program(experiment, 1)
+    program = Program(experiment, 1, shelf=shelf)
     params = jax.tree.map(lambda leaf: leaf[None], state.policy.params)
     keys = jax.random.key(seed)[None]
     (result,) = evaluate(keys, params, experiment.task, program, episodes)
