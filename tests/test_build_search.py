@@ -102,6 +102,17 @@ def test_a_search_that_found_a_better_policy_refines_that():
     assert info.objective[2] < alone(state)[1].objective[0]
 
 
+def test_what_refines_is_imagined_as_it_was_searched():
+    """A refined policy is good for particles; under their Gaussian it would be reported as worse than it is."""
+
+    def fresh(**search):
+        exp, state, _ = searcher(**search)
+        return eagerly(exp.imagine)(state)[1]
+
+    assert np.array_equal(fresh(refine=0.5), fresh(match=False))
+    assert not np.array_equal(fresh(refine=0.0), fresh(match=False))
+
+
 def test_a_refining_search_in_parts_is_the_whole():
     exp, state, run = searcher(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
     part, parts = eagerly(partial(exp.search, steps=1)), state

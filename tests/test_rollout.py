@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pegasus_jax import moments
-from pegasus_jax.rollout import NoiseUse, limited, rollout
+from pegasus_jax.rollout import UNROLL, NoiseUse, limited, rollout
 from pegasus_jax.scenarios import draw
 from pegasus_jax.types import Dynamics, Period, Policy, Prediction, Scenarios
 from probes import PENDULUM, Linear, known, linear_policy, rig
@@ -65,6 +65,25 @@ def test_the_scan_equals_a_python_loop(match, jitted):
     for ours, loops in zip(imagined, (xs, us, stds, seen), strict=True):
         assert ours.shape == np.shape(loops)
         np.testing.assert_allclose(ours, np.array(loops), rtol=2e-4, atol=2e-4)
+
+
+def test_an_unrolled_loop_is_the_loop(jitted, monkeypatch):
+    """Three steps at once, of four: neither values nor gradients know of it."""
+    r, given = rig(K, H), jitted[0](3)
+
+    def value(params):
+        rolled = rollout(
+            params, r.belief, given, dynamics=r.dynamics, policy=r.policy, match=moments.match, noise=NOISE
+        )
+        return sum(jnp.sum(jnp.sin(leaf)) for leaf in rolled)
+
+    loop = jax.jit(jax.value_and_grad(value))(r.params)
+    monkeypatch.setitem(UNROLL, jax.default_backend(), 3)
+    again = partial(value)  # a function of its own: what has been traced before is not traced again
+    assert "unroll=3" in str(jax.make_jaxpr(again)(r.params))
+    unrolled = jax.jit(jax.value_and_grad(again))(r.params)
+    for a, b in zip(jax.tree.leaves(loop), jax.tree.leaves(unrolled), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-4)
 
 
 @given(seed=seeds)

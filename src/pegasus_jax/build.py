@@ -182,7 +182,10 @@ def search_of(
     if search.starts > 1:
         lasting = search.anneal > 1  # one course for all searches: who began late would be behind
         searcher = best_of(searcher, policy.init, starts=search.starts, last=search.steps, lasting=lasting)
-    return searcher, partial(imagined, **pieces, match=match, blocks=blocks, cost=task.cost)
+    seen_last = (
+        match if refine is None else moments.keep
+    )  # a refined policy is good for particles, not for their Gaussian
+    return searcher, partial(imagined, **pieces, match=seen_last, blocks=blocks, cost=task.cost)
 
 
 def analytic_search_of(

@@ -9,6 +9,10 @@ import jax.numpy as jnp
 
 from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenarios
 
+# Platform -> steps of the time loop compiled as one, where a model has no kernel of its own. Each round of a loop costs
+# a GPU copies and launches (docs/costs.md); a processor would only compile longer.
+UNROLL = {"gpu": 5}
+
 
 class NoiseUse(NamedTuple):
     """Where observation noise enters a rollout, as factors of the model's predicted std (docs/reference.md 5.4)."""
@@ -60,7 +64,8 @@ def rollout(
     start = scenarios.start
     times = jnp.arange(scenarios.match.shape[0])
     draws = (times, scenarios.sensor, scenarios.match)
-    _, (x, u, std, seen) = jax.lax.scan(step, (start, jnp.zeros_like(start)), draws)
+    unroll = 1 if dynamics.particles else UNROLL.get(jax.default_backend(), 1)
+    _, (x, u, std, seen) = jax.lax.scan(step, (start, jnp.zeros_like(start)), draws, unroll=unroll)
     return Rollout(jnp.concatenate([start[None], x]), u, std, seen)
 
 
