@@ -2,7 +2,7 @@
 a checkout: its search and its fit on a workload of ours. Its package is used as it is; it is not part of this project.
 
 It needs torch and tqdm. What the package imports and this does not use (Gym environments) is left out, and what its
-Python still had (`collections.Iterable`) is put back.
+Python or its PyTorch still had (`collections.Iterable`, `torch.cholesky`) is put back.
 
 Its rollout and ours are one computation except for where noise and cost enter, so the states are compared, of the same
 weights, masks and draws: its model's noise moves the state where ours blurs what the policy sees (both are 0 in the
@@ -44,6 +44,7 @@ def load(checkout: Path) -> types.SimpleNamespace:
     if not (root / "algorithms" / "mc_pilco.py").is_file():
         raise FileNotFoundError(f"{checkout} is not a checkout of prob_mbrl")
     collections.Iterable = collections.abc.Iterable  # type: ignore[attr-defined]
+    Tensor.cholesky = torch.linalg.cholesky  # type: ignore[attr-defined]
     for name, folder in {"": root, ".algorithms": root / "algorithms"}.items():
         package = types.ModuleType(f"prob_mbrl{name}")
         package.__path__ = [str(folder)]

@@ -153,13 +153,13 @@ def improved(
     display.phase(trial, "fit", 0.02)
     states, fitted = fetched_info(program("fit", states))
     found = []
-    program.prepare("imagine")
-    program.prepare("calibrate", stacked)
     for i in range(program.chunks):
         cost = np.mean(found[-1].objective[:, -1]) if found else None
         display.phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)
         states, searched = fetched_info(program("search", states, jnp.int32(i * program.chunk)))
         found.append(jax.tree.map(np.asarray, searched))
+        program.prepare("imagine")  # once; not before the first of the search, for which everybody waits
+        program.prepare("calibrate", stacked)
     objective, norm = (np.concatenate([getattr(f, name) for f in found], 1) for name in ("objective", "gradient_norm"))
     skipped = fitted.skipped + sum(f.skipped for f in found)
     imagined, imagined_cost = fetched(program("imagine", states))
