@@ -44,7 +44,7 @@ def load(checkout: Path) -> types.SimpleNamespace:
     if not (root / "algorithms" / "mc_pilco.py").is_file():
         raise FileNotFoundError(f"{checkout} is not a checkout of prob_mbrl")
     collections.Iterable = collections.abc.Iterable  # type: ignore[attr-defined]
-    Tensor.cholesky = torch.linalg.cholesky  # type: ignore[attr-defined]
+    Tensor.cholesky = lambda matrix: torch.linalg.cholesky(matrix)  # type: ignore[attr-defined]
     for name, folder in {"": root, ".algorithms": root / "algorithms"}.items():
         package = types.ModuleType(f"prob_mbrl{name}")
         package.__path__ = [str(folder)]

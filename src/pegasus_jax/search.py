@@ -120,7 +120,7 @@ def optimise(
     optimizer = optax.with_extra_args_support(optimizer)
 
     def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], tuple[Array, Array]]:
-        learner, scenarios = carry
+        learner, scenarios = carry[0], unpacked(carry[1], like=drawn)
         if course.refine is not None:
             learner = jax.lax.cond(i == course.refine, better, lambda learner, *_: learner, learner, scenarios, i)
         value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios, *course.at(earlier + i))
@@ -131,7 +131,7 @@ def optimise(
             updates = optax.tree.scale(course.pace(earlier + i), updates)
         learner = Learner(optax.apply_updates(learner.params, updates), state)
         scenarios = redraw(key, i + 1, scenarios, belief)
-        return (learner, scenarios), (value, optax.tree.norm(gradient))
+        return (learner, packed(scenarios)), (value, optax.tree.norm(gradient))
 
     def better(learner: Learner, scenarios: Scenarios, i: Array) -> Learner:
         """The learner at its parameters or at those it was given; a tie, or NaN, goes to these."""
@@ -140,17 +140,31 @@ def optimise(
         of_old, of_new = jax.lax.map(lambda params: objective(params, belief, scenarios, *course.at(i)), both)
         return learner._replace(params=jax.tree.map(partial(jnp.where, of_new < of_old), learner.params, old))
 
-    scenarios = draw(key, first, belief)
+    drawn = draw(key, first, belief)
     given = learner.params
     if begin is not None:
         stage = course.at(earlier)
-        learner = at_first(first, begin, learner, lambda params: objective(params, belief, scenarios, *stage))
+        learner = at_first(first, begin, learner, lambda params: objective(params, belief, drawn, *stage))
     if course.refine is not None:
         kept = jax.tree.map(partial(jnp.where, first == 0), given, optax.tree.get(learner.optimizer, "start"))
         learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, start=kept))
     before = skipped(learner.optimizer)
-    (learner, _), (values, norms) = jax.lax.scan(step, (learner, scenarios), first + jnp.arange(steps))
+    (learner, _), (values, norms) = jax.lax.scan(step, (learner, packed(drawn)), first + jnp.arange(steps))
     return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
+
+
+def packed(scenarios: Params) -> Params:
+    """As one iteration hands them to the next: noise [H, K, D] as [H, K D].
+
+    A processor's compiler draws an array in the shape it is kept in, and rows of six dimensions take it five times as
+    long as rows of hundreds.
+    """
+    return jax.tree.map(lambda leaf: leaf.reshape(len(leaf), -1) if leaf.ndim > 2 else leaf, scenarios)
+
+
+def unpacked(packed: Params, like: Params) -> Params:
+    """The scenarios that were packed, in the shapes of `like`."""
+    return jax.tree.map(lambda leaf, shaped: leaf.reshape(shaped.shape), packed, like)
 
 
 def at_first(first: Array | int, begin: Begin, learner: Learner, value: Callable[[Params], Array]) -> Learner:
