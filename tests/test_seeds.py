@@ -6,12 +6,14 @@ import socket
 import subprocess
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pegasus_jax import program as programs
 from pegasus_jax import record
 from pegasus_jax.build import compose
 from pegasus_jax.program import Program, over_seeds
@@ -67,6 +69,17 @@ def test_evaluation_episodes_cost_the_same_side_by_side() -> None:
     assert alone.shape == (2, 3, experiment.task.horizon)
     assert np.ptp(alone[..., -1]) > 0
     np.testing.assert_allclose(alone, together, atol=1e-5)
+
+
+def test_the_options_of_another_compiler_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """JAX's versions differ in them, and one that is unknown would end a run before its first episode."""
+    other: Any = {"xla_of_another_version": True}
+    with pytest.raises(jax.errors.JaxRuntimeError, match="xla_of_another_version"):
+        jax.jit(jnp.sin).lower(0.0).compile(compiler_options=other)
+    assert programs.known(other | {"xla_backend_optimization_level": 1}) == {"xla_backend_optimization_level": 1}
+    monkeypatch.setattr(programs, "BRIEFLY", programs.BRIEFLY | other)
+    states = unchecked(Program(compose(tiny(), cart()), 1))("init", jax.random.key(0)[None])
+    assert int(states.trial[0]) == 0
 
 
 def test_the_cores_of_a_processor_share_the_seeds(study: Path) -> None:

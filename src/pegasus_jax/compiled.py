@@ -131,7 +131,7 @@ def touch(path: Path) -> None:
 
 def _find_lapack() -> None:
     """Let JAX look up LAPACK, which it does when it lowers a program that calls it, and a loaded one may."""
-    jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((2, 2), float))
+    jax.jit(jnp.linalg.cholesky).lower(jax.ShapeDtypeStruct((2, 2), jnp.float32))
 
 
 def _shapes(arguments: Any) -> tuple[Any, list]:

@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +91,7 @@ class Program:
                 over_seeds(function, axes, seeds=seeds),
                 kept=shelf and shelf.with_name(f"{shelf.name}-{name}{self.chunk if name == 'search' else ''}"),
                 **layout,
-                **({"compiler_options": LASTING if name in LONG else BRIEFLY} if on_processor else {}),
+                **({"compiler_options": known(LASTING if name in LONG else BRIEFLY)} if on_processor else {}),
             )
             for name, (function, axes) in functions.items()
         }
@@ -154,6 +154,20 @@ def share_processors(seeds: int) -> None:
     told = asked > 0 or "xla_force_host_platform" in os.environ.get("XLA_FLAGS", "")
     if not told:
         jax.config.update("jax_num_cpu_devices", max(n for n in range(1, processors() + 1) if seeds % n == 0))
+
+
+def known(options: dict[str, Any]) -> dict[str, Any]:
+    """Those of a compiler's options that the one at hand has: they come and go with its versions."""
+    return {name: value for name, value in options.items() if _has(name, value)}
+
+
+@cache
+def _has(name: str, value: Any) -> bool:
+    try:
+        jax.jit(lambda: jnp.zeros(())).lower().compile(compiler_options={name: value})
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
 
 
 def over_seeds(function: Callable[..., Any], axes: tuple[int | None, ...], *, seeds: int) -> Callable[..., Any]:
