@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 
 from pegasus_jax import dropout
 from pegasus_jax import mechanics_kernel as kernel
@@ -102,7 +103,9 @@ def test_compiles_for_a_gpu_that_is_not_there(case: dict, noise: dropout.Dropout
 
     seeds = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), (belief, masks, jnp.stack([x] * 3)))
     policies = jax.vmap(slope, (None, None, 0))
-    text = jax.jit(jax.vmap(policies)).trace(*seeds).lower(lowering_platforms=("cuda",)).as_text()
+    there = AbstractMesh((), (), abstract_device=AbstractDevice("NVIDIA H200", num_cores=None, platform="cuda"))
+    with use_abstract_mesh(there):
+        text = jax.jit(jax.vmap(policies)).trace(*seeds).lower(lowering_platforms=("cuda",)).as_text()
     assert text.count("@__gpu$xla.gpu.triton") == 2, "there and back"
 
 
