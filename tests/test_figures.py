@@ -228,11 +228,23 @@ def test_verdicts_follow_from_the_numbers(tmp_path):
     def verdict(lower, than, *trials):
         return claims.judge(Claim("", lower, than, trials), figure, tmp_path).verdict
 
-    assert verdict("tight", "loose", 1, 1) == "undecided"
+    assert verdict("tight", "loose", 1, 1) == "no difference"
     assert verdict("tight", "loose", 2, 3) == verdict("tight", "mine-loose", 1, 4) == "agrees"
     assert verdict("loose", "tight", 2, 2) == "contradicts"
     assert [verdict("tight", number, 2, 2) for number in (0.6, 0.4, 0.2)] == ["beats", "reaches", "misses"]
     assert verdict("tight", "loose", 2, 5) == verdict("tight", "other-one", 1, 1) == "not run yet"
+
+
+def test_the_same_seeds_are_compared_in_pairs(tmp_path):
+    """What is too small among seeds that differ so much shows from seed to seed; with other seeds it does not."""
+    figure = figure_of(tmp_path, TINY)
+    wide = np.linspace(0.2, 0.9, 12)[:, None] + np.zeros((12, 2))
+    write_study(tmp_path, "mine-tight", wide)
+    write_study(tmp_path, "mine-loose", wide + 0.02)
+    assert claims.judge(figure.claims[0], figure, tmp_path).verdict == "agrees"
+    path = tmp_path / "mine-loose.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"seeds": [*range(50, 62)]}))
+    assert claims.judge(figure.claims[0], figure, tmp_path).verdict == "undecided"
 
 
 def test_one_seed_decides_nothing(tmp_path):

@@ -11,7 +11,15 @@ from pegasus_jax.report.figures import Claim, Figure
 from pegasus_jax.study import SOLVED, first_solved
 
 MISSING = "not run yet"
+SAME = 0.05  # a difference in mean cost a step that nobody would choose a variant for: from 1.0 to 0.3 is to be learned
 HEADER = ["variant", "seeds", "trials", "cost at the last", "cost, mean of all", "solved at the last", "first solved"]
+
+
+class Costs(NamedTuple):
+    """Mean cost a step of each seed, over some trials."""
+
+    seeds: list[int]
+    mean: np.ndarray  # [S]
 
 
 class Judged(NamedTuple):
@@ -20,46 +28,50 @@ class Judged(NamedTuple):
     claim: Claim
     lower: str
     than: str
+    difference: str
     verdict: str
 
 
 def judge(claim: Claim, figure: Figure, out: Path) -> Judged:
     """What the studies in `out` say to a claim, by 95 % bootstrap intervals of interquartile means over seeds.
 
-    Of two variants: agrees or contradicts where the interval of the difference leaves out 0, else undecided. With a
-    published number: beats, reaches or misses it, as the interval lies below, around or above.
+    Of two variants: agrees or contradicts where the interval of the difference leaves out 0; where it does not, no
+    difference if it is within SAME, else undecided. The same seeds are drawn in pairs: their first episodes are the
+    same. With a published number: beats, reaches or misses it, as the interval lies below, around or above.
     """
     first = costs(claim.lower, claim.trials, figure, out)
     second = costs(claim.than, claim.trials, figure, out) if isinstance(claim.than, str) else claim.than
     if first is None or second is None:
-        verdict = MISSING
-    elif isinstance(second, np.ndarray):
-        verdict = word(interval(first, second), 0.0, ("agrees", "undecided", "contradicts"))
+        return Judged(claim, estimate(first), estimate(second), MISSING, MISSING)
+    if isinstance(second, Costs):
+        low, high = interval(first.mean, second.mean, paired=first.seeds == second.seeds)
+        neither = "no difference" if max(-low, high) <= SAME else "undecided"
+        words, other = ("agrees", neither, "contradicts"), middle(second.mean)
     else:
-        verdict = word(interval(first), second, ("beats", "reaches", "misses"))
-    return Judged(claim, estimate(first), estimate(second), verdict)
+        low, high = (end - second for end in interval(first.mean))
+        words, other = ("beats", "reaches", "misses"), second
+    verdict = words[0] if high < 0 else words[2] if low > 0 else words[1]
+    difference = f"{middle(first.mean) - other:+.3f} [{low:+.3f}, {high:+.3f}]"
+    return Judged(claim, estimate(first), estimate(second), difference, verdict)
 
 
-def costs(variant: str, trials: tuple[int, int], figure: Figure, out: Path) -> np.ndarray | None:
-    """Mean cost of each seed [S] over the trials, from and to; None where they have not all been run."""
+def costs(variant: str, trials: tuple[int, int], figure: Figure, out: Path) -> Costs | None:
+    """A study's costs over the trials, from and to; None where they have not all been run."""
     result = stored(out, f"{figure.name}-{variant}" if variant in figure.variants else variant)
     if result is None or len(result["plant_seconds"]) < trials[1]:
         return None
-    return np.asarray(result["mean_cost"], float)[:, trials[0] - 1 : trials[1]].mean(1)
+    return Costs(result["seeds"], np.asarray(result["mean_cost"], float)[:, trials[0] - 1 : trials[1]].mean(1))
 
 
-def word(between: tuple[np.ndarray, np.ndarray], number: float, words: tuple[str, str, str]) -> str:
-    """The first word where the interval lies below the number, the second where it holds it, else the third."""
-    low, high = between
-    return words[0] if high < number else words[2] if low > number else words[1]
-
-
-def estimate(values: np.ndarray | float | None) -> str:
-    """Interquartile mean of seeds [S] and its interval; of a published number, itself."""
-    if values is None:
+def estimate(value: Costs | float | None) -> str:
+    """Interquartile mean over seeds and its interval; of a published number, itself."""
+    if value is None:
         return MISSING
-    if not isinstance(values, np.ndarray):
-        return f"{values:g}"
+    return middling(value.mean) if isinstance(value, Costs) else f"{value:g}"
+
+
+def middling(values: np.ndarray) -> str:
+    """Interquartile mean of seeds [S] and its interval."""
     low, high = interval(values)
     return f"{middle(values):.3f} [{low:.3f}, {high:.3f}]" if len(values) > 1 else f"{values[0]:.3f}"
 
@@ -76,7 +88,7 @@ def row(label: str, result: Result) -> list[str]:
     cost, success = (np.asarray(result[name], float) for name in ("mean_cost", "success_rate"))
     solved = f"{np.sum(success[:, -1] >= SOLVED)} of {len(cost)}"
     shape = [str(count) for count in cost.shape]
-    return [label, *shape, estimate(cost[:, -1]), estimate(cost.mean(1)), solved, when(result["success_rate"])]
+    return [label, *shape, middling(cost[:, -1]), middling(cost.mean(1)), solved, when(result["success_rate"])]
 
 
 def when(success_rate: list[list[float]]) -> str:
@@ -99,8 +111,9 @@ def claims_table(figure: Figure, out: Path) -> list[list[str]]:
         first, last = claim.trials
         span = f"trial {first}" if first == last else f"trials {first} to {last}"
         than = claim.than if isinstance(claim.than, str) else "published"
-        rows.append([claim.says, span, f"{claim.lower}: {judged.lower}", f"{than}: {judged.than}", judged.verdict])
-    return [["claim", "mean cost of", "lower", "than", "verdict"], *rows]
+        sides = [f"{claim.lower}: {judged.lower}", f"{than}: {judged.than}"]
+        rows.append([claim.says, span, *sides, judged.difference, judged.verdict])
+    return [["claim", "mean cost of", "lower", "than", "difference", "verdict"], *rows]
 
 
 def markdown(table: list[list[str]]) -> str:

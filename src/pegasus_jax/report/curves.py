@@ -84,10 +84,11 @@ def middle(values: np.ndarray, axis: int = 0) -> np.ndarray:
     return trim_mean(values, 0.25, axis=axis)
 
 
-def interval(*samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def interval(*samples: np.ndarray, paired: bool = False) -> tuple[np.ndarray, np.ndarray]:
     """The 95 % bootstrap interval of the interquartile mean over seeds [S, ...]; of two samples, of the difference.
 
-    Unbounded for a single seed, which says nothing of the others.
+    `paired` says that both samples have the same seeds, in one order. Unbounded for a single seed, which says nothing
+    of the others.
     """
     if min(map(len, samples)) < 2:
         return np.full(samples[0].shape[1:], -np.inf), np.full(samples[0].shape[1:], np.inf)
@@ -95,6 +96,6 @@ def interval(*samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     def statistic(first: np.ndarray, *second: np.ndarray, axis: int) -> np.ndarray:
         return middle(first, axis) - sum(middle(other, axis) for other in second)
 
-    options: dict = dict(axis=0, n_resamples=2000, method="percentile", rng=np.random.default_rng(0))
+    options: dict = dict(axis=0, n_resamples=2000, method="percentile", paired=paired, rng=np.random.default_rng(0))
     found = bootstrap(samples, statistic, **options).confidence_interval
     return found.low, found.high
