@@ -1,9 +1,11 @@
 """Many seeds as one program: each leaves the run it would have left alone, and none disturbs another."""
 
 import json
+import os
 import signal
 import socket
 import subprocess
+import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -86,6 +88,23 @@ def test_the_cores_of_a_processor_share_the_seeds(study: Path) -> None:
     """Two of them for two seeds; on a machine of one there is nothing to share."""
     devices = json.loads((study / "seed1" / "run.json").read_text())["devices"]
     assert len(devices) == min(2, record.processors())
+
+
+@pytest.mark.parametrize(
+    ("seeds", "particles", "threads"), [(1, 100, 1), (1, 1000, None), (3, 100, None), (1, None, None)]
+)
+def test_one_thread_imagines_few_particles(seeds: int, particles: int | None, threads: int | None) -> None:
+    """As the system counts XLA's threads, in a process of its own; a machine of one processor has one in any case."""
+    code = f"""
+import pathlib, jax
+from pegasus_jax.program import share_processors
+share_processors({seeds}, {particles})
+jax.block_until_ready(jax.jit(lambda: jax.numpy.ones(3))())
+print(sum("XLAEigen" in path.read_text() for path in pathlib.Path("/proc/self/task").glob("*/comm")))
+"""
+    environment = {k: v for k, v in os.environ.items() if k not in ("NPROC", "XLA_FLAGS", "JAX_NUM_CPU_DEVICES")}
+    found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert int(found.stdout) == (threads or record.processors())
 
 
 def test_killed_and_resumed_is_bit_equal(study: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pegasus_jax.checks import SettingError
-from pegasus_jax.config import Config
+from pegasus_jax.config import Config, Search
 
 TRAIN = """\
 pegasus-train task=NAME [setting=value ...]     learn a controller
@@ -155,7 +155,8 @@ def _train(words: Sequence[str]) -> None:
     from pegasus_jax.program import leads, share_processors
 
     if not {"mesh", "distributed", "coordinator"} & {*options}:
-        share_processors(len(runs))
+        search = config.search
+        share_processors(len(runs), search.particles * search.starts if isinstance(search, Search) else None)
     over = _mesh(options.get("mesh"), len(runs))
     from pegasus_jax.build import build
 

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,7 @@ NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 BRIEFLY = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
 LASTING = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512}
 LONG = ("fit", "search")
+FEW = 128  # particles that one thread of a processor imagines as fast as two
 
 
 class Jitted:
@@ -144,12 +146,15 @@ class Program:
         return {name: round(spent.get(name, 0.0), 3) for name in NAMES}
 
 
-def share_processors(seeds: int) -> None:
+def share_processors(seeds: int, particles: int | None = None) -> None:
     """Where a CPU does the work, make a device of as many of its cores as share the seeds evenly, unless JAX was told.
 
-    One program for all seeds hardly uses a second core: a seed's matrices are too small to be shared. To be called
-    before JAX has looked for devices.
+    One program for all seeds hardly uses a second core: a seed's matrices are too small to be shared. Where so few
+    `particles` are imagined at once, threads would cost more than they do: then there is one (docs/costs.md). To be
+    called before JAX has looked for devices.
     """
+    if particles is not None and seeds * particles <= FEW and not entry_points(group="jax_plugins"):  # no accelerator
+        os.environ.setdefault("NPROC", "1")  # what XLA asks for the number of its threads
     asked = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
     told = asked > 0 or "xla_force_host_platform" in os.environ.get("XLA_FLAGS", "")
     if not told:

@@ -2,6 +2,7 @@
 
 title = "Gradient clipping"
 paper = "What the paper says about it, in one paragraph."       # optional
+found = "What these studies say to that, in one more."          # optional
 seeds = "0-9"
 trials = 15
 picture = "area"                                                # optional; "curves" if left out
@@ -41,6 +42,7 @@ class Figure(NamedTuple):
     name: str
     title: str
     paper: str
+    found: str
     seeds: str
     trials: int
     picture: str
@@ -54,6 +56,7 @@ NEEDED = ("title", "trials", "variants")
 KINDS: dict[str, type] = {
     "title": str,
     "paper": str,
+    "found": str,
     "seeds": str,
     "trials": int,
     "picture": str,
@@ -88,7 +91,9 @@ def read(path: Path) -> Figure:
     if said.get("picture", "curves") not in PICTURES:
         raise SettingError(f"{path}: picture={said['picture']} is unknown; {nearest(said['picture'], PICTURES)}")
     claims = tuple(_claim(path, claim) for claim in said.get("claims", ()))
-    fields: dict[str, Any] = dict(paper="", seeds="0-9", picture="curves", common="") | said | {"claims": claims}
+    fields: dict[str, Any] = (
+        dict(paper="", found="", seeds="0-9", picture="curves", common="") | said | {"claims": claims}
+    )
     return Figure(path.stem, **fields)
 
 
