@@ -8,11 +8,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pegasus_jax import gaussian
-from test_gaussian import COV, MATRIX, MEAN, OFFSET, SAMPLES, D, random_cov, x64  # noqa: F401 (a fixture)
+from test_gaussian import COV, MATRIX, MEAN, OFFSET, SAMPLES, D, random_cov, standard_normals
+
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def test_against_samples():
-    deviation = np.random.default_rng(42).normal(size=(SAMPLES, D)) @ np.linalg.cholesky(COV).T
+    deviation = standard_normals(D) @ np.linalg.cholesky(COV).T
     for width in (0.25, 1.0, 5.0):
         costs = 1 - np.exp(-0.5 * np.sum(((MEAN + deviation) @ MATRIX.T + OFFSET) ** 2, 1) / width**2)
         expected = gaussian.saturating_cost(jnp.array(MEAN), jnp.array(COV), MATRIX, OFFSET, width)

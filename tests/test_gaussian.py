@@ -17,11 +17,7 @@ from pegasus_jax import angles, gaussian
 SAMPLES = 1_000_000
 D, OUTPUTS, POINTS, WAVES = 3, 2, 8, 8
 
-
-@pytest.fixture(autouse=True)
-def x64():
-    with jax.enable_x64(True):
-        yield
+pytestmark = pytest.mark.usefixtures("x64")
 
 
 def random_cov(seed, size, scale=0.5):

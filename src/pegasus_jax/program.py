@@ -153,12 +153,13 @@ def share_processors(seeds: int, particles: int | None = None) -> None:
     `particles` are imagined at once, threads would cost more than they do: then there is one (docs/costs.md). To be
     called before JAX has looked for devices.
     """
-    if particles is not None and seeds * particles <= FEW and not entry_points(group="jax_plugins"):  # no accelerator
-        os.environ.setdefault("NPROC", "1")  # what XLA asks for the number of its threads
     asked = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
     told = asked > 0 or "xla_force_host_platform" in os.environ.get("XLA_FLAGS", "")
-    if not told:
-        jax.config.update("jax_num_cpu_devices", max(n for n in range(1, processors() + 1) if seeds % n == 0))
+    if told:
+        return
+    jax.config.update("jax_num_cpu_devices", max(n for n in range(1, processors() + 1) if seeds % n == 0))
+    if particles is not None and seeds * particles <= FEW and not entry_points(group="jax_plugins"):  # no accelerator
+        os.environ.setdefault("NPROC", "1")  # what XLA asks for the number of its threads
 
 
 def known(options: dict[str, Any]) -> dict[str, Any]:
