@@ -33,7 +33,7 @@ from benchmarks.workloads import workload
 from pegasus_jax import mesh, settings
 from pegasus_jax.build import build, compose, set_precision
 from pegasus_jax.config import Config
-from pegasus_jax.program import Jitted, over_seeds, placed
+from pegasus_jax.program import LASTING, Jitted, compiler_options, over_seeds, placed
 from pegasus_jax.record import about
 from pegasus_jax.trial import EVALUATE, trial_key
 from pegasus_jax.types import Array, Experiment, RunState
@@ -49,7 +49,7 @@ EPISODES = 20  # of evaluation
 def spread(function: Callable[..., Any], axes: tuple[int | None, ...], seeds: int, over: Mesh | None) -> Jitted:
     """The function over seeds, and these over a mesh, as `pegasus-train seeds= mesh=` compiles it."""
     layout = {} if over is None else {"out_shardings": mesh.over_seeds(over)}
-    return Jitted(over_seeds(function, axes, seeds=seeds), **layout)
+    return Jitted(over_seeds(function, axes, seeds=seeds), compiler_options=compiler_options(LASTING), **layout)
 
 
 def parts_of(experiment: Experiment) -> dict[str, Callable[[RunState], Any]]:

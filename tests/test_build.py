@@ -17,6 +17,7 @@ from pegasus_jax.build import (
     dropout_of,
     policy_of,
     search_of,
+    set_precision,
     start,
 )
 from pegasus_jax.checks import SettingError
@@ -215,6 +216,26 @@ def test_pilco_improves_a_policy_under_a_model(model, policy, task):
     rolled, costs = jax.jit(exp.imagine)(after)
     assert rolled.x.shape[:2] == (5, 5)
     assert costs.shape == (4, 5)
+
+
+@pytest.fixture
+def usual():
+    """JAX's own precision, then and afterwards."""
+    before = jax.config.jax_default_matmul_precision
+    jax.config.update("jax_default_matmul_precision", None)
+    yield
+    jax.config.update("jax_default_matmul_precision", before)
+
+
+@pytest.mark.parametrize(
+    ("platform", "told", "expected"),
+    [("gpu", None, "float32"), ("gpu", "tensorfloat32", "tensorfloat32"), ("cpu", None, None)],
+)
+def test_a_gpus_products_have_single_precision_unless_it_was_told(monkeypatch, usual, platform, told, expected):
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    jax.config.update("jax_default_matmul_precision", told)
+    set_precision(Config())
+    assert jax.config.jax_default_matmul_precision == expected
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,10 +79,36 @@ def test_the_options_of_another_compiler_are_left_out(monkeypatch: pytest.Monkey
     other: Any = {"xla_of_another_version": True}
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_of_another_version"):
         jax.jit(jnp.sin).lower(0.0).compile(compiler_options=other)
-    assert programs.known(other | {"xla_backend_optimization_level": 1}) == {"xla_backend_optimization_level": 1}
-    monkeypatch.setattr(programs, "BRIEFLY", programs.BRIEFLY | other)
+    known = {"xla_backend_optimization_level": 1}
+    here = jax.default_backend()
+    assert programs.compiler_options({here: other | known}) == known
+    monkeypatch.setitem(programs.BRIEFLY, here, other | known)
     states = unchecked(Program(compose(tiny(), cart()), 1))("init", jax.random.key(0)[None])
     assert int(states.trial[0]) == 0
+
+
+def test_a_gpu_is_told_how_to_run_loops_unless_the_user_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The options are ones that the JAX at hand has: its compiler for processors reads them too."""
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    whole, abreast = "xla_gpu_enable_command_buffer", "xla_gpu_command_buffer_scheduling_mode"
+    assert {*programs.compiler_options(programs.LASTING)} == {whole, abreast}
+    assert {*programs.compiler_options(programs.BRIEFLY, own_kernels=True)} == {whole}
+    monkeypatch.setenv("XLA_FLAGS", f"--{whole}=")
+    assert {*programs.compiler_options(programs.LASTING)} == {abreast}
+
+
+def test_how_it_is_compiled_changes_no_result() -> None:
+    """Graphs of kernels where these tests run on a GPU, wide vectors on a processor. A few steps: rounding grows."""
+    experiment = compose(tiny(), cart())
+    given = experiment.absorb(state := experiment.init(jax.random.key(0)), experiment.collect(state))
+    for part in (partial(experiment.fit, steps=10), partial(experiment.search, steps=5)):
+        lowered = jax.jit(part).lower(given)
+        (given, plainly), (_, as_a_run) = (
+            lowered.compile(compiler_options=options)(given)
+            for options in ({}, programs.compiler_options(programs.LASTING))
+        )
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4), as_a_run, plainly)
 
 
 def test_the_cores_of_a_processor_share_the_seeds(study: Path) -> None:

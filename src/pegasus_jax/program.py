@@ -22,11 +22,25 @@ from pegasus_jax.types import Experiment
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 
-# How a processor compiles. What runs for milliseconds need not be compiled well: without emitters it is ready in two
-# thirds of the time, and a tenth slower. A fit or a search runs for seconds, and gains by wide vectors; the compiler's
-# highest level gains it nothing over the first, which takes a tenth less.
-BRIEFLY = {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False}
-LASTING = {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512}
+# How a GPU runs loops: whole, as graphs of kernels, so that no round waits for the host. The compiler's usual kinds of
+# kernels are listed because WHILE alone would leave them out.
+GRAPHS = {
+    "xla_gpu_enable_command_buffer": "CONDITIONAL,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,FUSION,WHILE"
+}
+# And side by side the kernels of a graph that do not wait for each other (docs/costs.md).
+ABREAST = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+
+# The compiler's options by platform. On a processor what runs for milliseconds need not be compiled well: without
+# emitters it is ready in two thirds of the time, and a tenth slower. A fit or a search runs for seconds, and gains by
+# wide vectors; the compiler's highest level gains it nothing over the first, which takes a tenth less.
+BRIEFLY: dict[str, dict] = {
+    "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
+    "gpu": GRAPHS | ABREAST,
+}
+LASTING: dict[str, dict] = {
+    "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512},
+    "gpu": GRAPHS | ABREAST,
+}
 LONG = ("fit", "search")
 FEW = 128  # particles that one thread of a processor imagines as fast as two
 
@@ -87,13 +101,13 @@ class Program:
         }
         self.axes = {name: axes for name, (_, axes) in functions.items()}
         layout = {} if over is None else {"out_shardings": mesh.over_seeds(over)}
-        on_processor = jax.default_backend() == "cpu"
+        own_kernels = experiment.dynamics.particles is not None
         self.parts = {
             name: Jitted(
                 over_seeds(function, axes, seeds=seeds),
                 kept=shelf and shelf.with_name(f"{shelf.name}-{name}{self.chunk if name == 'search' else ''}"),
+                compiler_options=compiler_options(LASTING if name in LONG else BRIEFLY, own_kernels),
                 **layout,
-                **({"compiler_options": known(LASTING if name in LONG else BRIEFLY)} if on_processor else {}),
             )
             for name, (function, axes) in functions.items()
         }
@@ -162,9 +176,16 @@ def share_processors(seeds: int, particles: int | None = None) -> None:
         os.environ.setdefault("NPROC", "1")  # what XLA asks for the number of its threads
 
 
-def known(options: dict[str, Any]) -> dict[str, Any]:
-    """Those of a compiler's options that the one at hand has: they come and go with its versions."""
-    return {name: value for name, value in options.items() if _has(name, value)}
+def compiler_options(by_platform: dict[str, dict[str, Any]], own_kernels: bool = False) -> dict[str, Any]:
+    """The compiler's options for the platform at hand: those that its version has, and XLA_FLAGS does not speak of.
+
+    With `own_kernels`, kernels that the compiler did not write, none runs abreast of others: it has not been tried.
+    """
+    wanted, told = by_platform.get(jax.default_backend(), {}), os.environ.get("XLA_FLAGS", "")
+    untried = ABREAST if own_kernels else {}
+    return {
+        name: value for name, value in wanted.items() if name not in told and name not in untried and _has(name, value)
+    }
 
 
 @cache

@@ -15,7 +15,7 @@ from pegasus_jax import mesh, settings
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
-from pegasus_jax.program import described
+from pegasus_jax.program import LASTING, compiler_options, described
 from pegasus_jax.record import write_whole
 from pegasus_jax.tasks import GYM
 from pegasus_jax.train import saturated, succeeded
@@ -49,11 +49,12 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
     began = time.monotonic()
     one = each(lambda state: trial(state, experiment), (SEEDS,), (SEEDS, 0))
     lowered = jax.jit(one, out_shardings=(laid_out, own)).lower(states)
-    program = lowered.compile()
+    how = compiler_options(LASTING, experiment.dynamics.particles is not None)
+    program = lowered.compile(compiler_options=how)
     # A program of its own, so that looking changes no number.
     infos = lowered.out_info[1] if own is None else described(lowered.out_info[1], own)
     look = jax.jit(each(partial(diagnosed, experiment), (SEEDS, SEEDS, 0)), out_shardings=own)
-    look = look.lower(states, states, infos).compile()
+    look = look.lower(states, states, infos).compile(compiler_options=how)
     compiled = time.monotonic()
     infos, looks, result = [], [], {}
     for count in range(1, config.trials + 1):
