@@ -36,7 +36,7 @@ from pegasus_jax.config import Config
 from pegasus_jax.program import LASTING, Jitted, compiler_options, over_seeds, placed
 from pegasus_jax.record import about
 from pegasus_jax.trial import EVALUATE, trial_key
-from pegasus_jax.types import Array, Experiment, RunState
+from pegasus_jax.types import Array, Dynamics, Experiment, RunState
 
 Row = dict[str, Any]
 Report = Callable[[str, Row], None]  # (the row's name, the row) -> printed and on disk
@@ -46,10 +46,13 @@ COLLECTIVE = re.compile(
 EPISODES = 20  # of evaluation
 
 
-def spread(function: Callable[..., Any], axes: tuple[int | None, ...], seeds: int, over: Mesh | None) -> Jitted:
+def spread(
+    function: Callable[..., Any], axes: tuple[int | None, ...], seeds: int, over: Mesh | None, dynamics: Dynamics
+) -> Jitted:
     """The function over seeds, and these over a mesh, as `pegasus-train seeds= mesh=` compiles it."""
     layout = {} if over is None else {"out_shardings": mesh.over_seeds(over)}
-    return Jitted(over_seeds(function, axes, seeds=seeds), compiler_options=compiler_options(LASTING), **layout)
+    how = compiler_options(LASTING, dynamics)
+    return Jitted(over_seeds(function, axes, seeds=seeds), compiler_options=how, **layout)
 
 
 def parts_of(experiment: Experiment) -> dict[str, Callable[[RunState], Any]]:
@@ -70,8 +73,9 @@ def study(config: Config, seeds: int, over: Mesh | None, report: Callable[[Row],
     """Seconds of every trial of a study, and of its parts; reported after each trial."""
     set_precision(config)
     experiment = build(config, over)
-    parts = {name: spread(function, (0,), seeds, over) for name, function in parts_of(experiment).items()}
-    states = spread(experiment.init, (0,), seeds, over)(on_devices(jax.vmap(jax.random.key)(jnp.arange(seeds)), over))
+    prepared = partial(spread, axes=(0,), seeds=seeds, over=over, dynamics=experiment.dynamics)
+    parts = {name: prepared(function) for name, function in parts_of(experiment).items()}
+    states = prepared(experiment.init)(on_devices(jax.vmap(jax.random.key)(jnp.arange(seeds)), over))
     devices = 1 if over is None else over.devices.size
     row: Row = {"seeds": seeds, "devices": devices, "device": jax.devices()[0].device_kind, "trial_s": []}
     spent: dict[str, list[float]] = {name: [] for name in parts}
@@ -141,7 +145,7 @@ def of_particles(options: dict[str, str], words: dict[str, str], report: Report)
     for count in numbers(options, "devices", "1,4"):
         over = mesh.mesh(1, count)
         experiment = compose(config, small.task, mesh=over)
-        search = spread(partial(experiment.search, steps=steps), (0, None), 1, over)
+        search = spread(partial(experiment.search, steps=steps), (0, None), 1, over, experiment.dynamics)
         arguments: tuple[Any, ...] = (states, jnp.int32(1))  # not 0, which would also weigh a fresh policy
         if over is not None:
             arguments = placed(states, mesh.over_seeds(over)), placed(jnp.int32(1), mesh.shared(over))

@@ -93,7 +93,10 @@ def test_a_gpu_is_told_how_to_run_loops_unless_the_user_says(monkeypatch: pytest
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     whole, abreast = "xla_gpu_enable_command_buffer", "xla_gpu_command_buffer_scheduling_mode"
     assert {*programs.compiler_options(programs.LASTING)} == {whole, abreast}
-    assert {*programs.compiler_options(programs.BRIEFLY, own_kernels=True)} == {whole}
+    dynamics = compose(tiny(), cart()).dynamics
+    assert {*programs.compiler_options(programs.BRIEFLY, dynamics)} == {whole, abreast}
+    own_kernels = dynamics._replace(particles=lambda apply: apply)
+    assert {*programs.compiler_options(programs.BRIEFLY, own_kernels)} == {whole}
     monkeypatch.setenv("XLA_FLAGS", f"--{whole}=")
     assert {*programs.compiler_options(programs.LASTING)} == {abreast}
 

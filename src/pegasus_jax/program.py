@@ -18,7 +18,7 @@ from jax.sharding import Mesh, NamedSharding
 from pegasus_jax import mesh
 from pegasus_jax.compiled import program
 from pegasus_jax.record import processors
-from pegasus_jax.types import Experiment
+from pegasus_jax.types import Dynamics, Experiment
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 
@@ -27,7 +27,7 @@ NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 GRAPHS = {
     "xla_gpu_enable_command_buffer": "CONDITIONAL,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,FUSION,WHILE"
 }
-# And side by side the kernels of a graph that do not wait for each other (docs/costs.md).
+# And side by side the kernels of a graph that do not wait for each other (docs/decisions/0013).
 ABREAST = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
 
 # The compiler's options by platform. On a processor what runs for milliseconds need not be compiled well: without
@@ -101,12 +101,11 @@ class Program:
         }
         self.axes = {name: axes for name, (_, axes) in functions.items()}
         layout = {} if over is None else {"out_shardings": mesh.over_seeds(over)}
-        own_kernels = experiment.dynamics.particles is not None
         self.parts = {
             name: Jitted(
                 over_seeds(function, axes, seeds=seeds),
                 kept=shelf and shelf.with_name(f"{shelf.name}-{name}{self.chunk if name == 'search' else ''}"),
-                compiler_options=compiler_options(LASTING if name in LONG else BRIEFLY, own_kernels),
+                compiler_options=compiler_options(LASTING if name in LONG else BRIEFLY, experiment.dynamics),
                 **layout,
             )
             for name, (function, axes) in functions.items()
@@ -176,13 +175,13 @@ def share_processors(seeds: int, particles: int | None = None) -> None:
         os.environ.setdefault("NPROC", "1")  # what XLA asks for the number of its threads
 
 
-def compiler_options(by_platform: dict[str, dict[str, Any]], own_kernels: bool = False) -> dict[str, Any]:
+def compiler_options(by_platform: dict[str, dict[str, Any]], dynamics: Dynamics | None = None) -> dict[str, Any]:
     """The compiler's options for the platform at hand: those that its version has, and XLA_FLAGS does not speak of.
 
-    With `own_kernels`, kernels that the compiler did not write, none runs abreast of others: it has not been tried.
+    Where the `dynamics` bring kernels of their own, none runs abreast of others: it has not been tried.
     """
     wanted, told = by_platform.get(jax.default_backend(), {}), os.environ.get("XLA_FLAGS", "")
-    untried = ABREAST if own_kernels else {}
+    untried = ABREAST if dynamics is not None and dynamics.particles else {}
     return {
         name: value for name, value in wanted.items() if name not in told and name not in untried and _has(name, value)
     }

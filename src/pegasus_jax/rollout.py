@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenarios
 
 # Platform -> steps of the time loop compiled as one, where a model has no kernel of its own. Each round of a loop costs
-# a GPU copies and launches (docs/costs.md); a processor would only compile longer.
+# a GPU copies and launches (docs/decisions/0013); a processor would only compile longer.
 UNROLL = {"gpu": 5}
 
 
