@@ -30,6 +30,7 @@ SIBLINGS: set[tuple[str, str]] = {
     ("variants", "config"),  # a variant is made of settings
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
     ("calibration", "angles"),  # an error of 359 degrees is one of 1
+    ("gaussian", "moments"),  # one Cholesky factor for a few dimensions
     ("cost", "gaussian"),  # the expected cost of a Gaussian state
     ("cost", "moments"),  # of the Gaussian with the particles' mean and covariance
     ("scenarios", "mesh"),  # where the particles that it draws lie

@@ -1,5 +1,7 @@
 """Angles enter networks as (sin, cos) and leave data as wrapped differences (Deisenroth 2010)."""
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 import numpy as np
 
@@ -8,9 +10,14 @@ from pegasus_jax.types import Array
 
 def encode(x: Array, angles: tuple[int, ...]) -> Array:
     """Features [..., F] of states x [..., D]: the other dimensions, then all sines, then all cosines; F = D + A."""
-    plain = [i for i in range(x.shape[-1]) if i not in angles]
-    angle = x[..., np.array(angles, int)]
-    return jnp.concatenate([x[..., np.array(plain, int)], jnp.sin(angle), jnp.cos(angle)], axis=-1)
+    plain = pick(x, [i for i in range(x.shape[-1]) if i not in angles])
+    angle = pick(x, angles)
+    return jnp.concatenate([plain, jnp.sin(angle), jnp.cos(angle)], axis=-1)
+
+
+def pick(x: Array, indices: Sequence[int]) -> Array:
+    """x[..., indices] by slices: a GPU's compiler joins them with what is around them, there and back."""
+    return jnp.concatenate([x[..., :0], *(x[..., i : i + 1] for i in indices)], axis=-1)
 
 
 def feature_names(names: tuple[str, ...], angles: tuple[int, ...]) -> tuple[str, ...]:

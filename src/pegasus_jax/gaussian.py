@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pegasus_jax.moments import cholesky
 from pegasus_jax.types import Array
 
 
@@ -159,11 +160,15 @@ def saturating_cost(
     """E[1 - exp(-|matrix @ phi + offset|^2 / (2 width^2))], in [0, 1], for Gaussian features phi [F].
 
     `matrix` [E, F], `offset` [E] and `width` share the unit of the error, [m] for the distance of a tip from its goal
-    (Deisenroth 2010, sec. 3.7.1). Only E x E matrices are factorised.
+    (Deisenroth 2010, sec. 3.7.1). Only a matrix of E + 1 dimensions is factorised.
     """
     error, spread, _ = affine(mean, cov, matrix / width, offset / width)
     ratio = jnp.eye(error.shape[0], dtype=mean.dtype) + spread
-    exponent = error @ jnp.linalg.solve(ratio, error) + jnp.linalg.slogdet(ratio)[1]
+    # Bordered by the error, the ratio R = L L' has a factor whose last row is L^-1 error: error' R^-1 error and log |R|
+    # are read off it. R is at least the identity, so this corner keeps the last pivot positive.
+    corner = 1 + error @ error
+    root = cholesky(jnp.block([[ratio, error[:, None]], [error[None], corner[None, None]]]))
+    exponent = jnp.sum(root[-1, :-1] ** 2) + 2 * jnp.sum(jnp.log(jnp.diagonal(root)[:-1]))
     return 1 - jnp.exp(-0.5 * exponent)
 
 
