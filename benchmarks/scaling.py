@@ -52,7 +52,7 @@ def spread(
     """The function over seeds, and these over a mesh, as `pegasus-train seeds= mesh=` compiles it."""
     layout = {} if over is None else {"out_shardings": mesh.over_seeds(over)}
     how = compiler_options(LASTING, dynamics)
-    return Jitted(over_seeds(function, axes, seeds=seeds), compiler_options=how, **layout)
+    return Jitted(over_seeds(function, axes, seeds=seeds, over=over), compiler_options=how, **layout)
 
 
 def parts_of(experiment: Experiment) -> dict[str, Callable[[RunState], Any]]:

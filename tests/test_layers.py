@@ -15,7 +15,8 @@ ROOT = Path(__file__).resolve().parents[1]
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
     0: "types checks config variants",
-    1: "angles mesh dropout whiten moments gaussian cost course dataset scenarios rollout episode calibration",
+    1: "angles mesh dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout episode"
+    " calibration",
     2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco",
     3: "dynamics. policy. trial",
     4: "tasks",
@@ -30,6 +31,8 @@ SIBLINGS: set[tuple[str, str]] = {
     ("variants", "config"),  # a variant is made of settings
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
     ("calibration", "angles"),  # an error of 359 degrees is one of 1
+    ("moments", "mesh"),  # whether particles are whole on one GPU
+    ("moments", "moments_kernel"),  # and are then matched by a kernel
     ("gaussian", "moments"),  # one Cholesky factor for a few dimensions
     ("cost", "gaussian"),  # the expected cost of a Gaussian state
     ("cost", "moments"),  # of the Gaussian with the particles' mean and covariance

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 
+from pegasus_jax.mesh import alone_on_gpu
 from pegasus_jax.types import Array
 
 
@@ -55,8 +56,17 @@ def mean_and_cov(x: Array) -> tuple[Array, Array]:
 def match(x: Array, z: Array) -> Array:
     """Particles [K, D] redrawn as mean + L z from the Gaussian fitted to x [K, D]; z [K, D] is standard normal.
 
-    Alg. 3 line 14, whose Sigma z is a slip of notation for L z with L L' = Sigma.
+    Alg. 3 line 14, whose Sigma z is a slip of notation for L z with L L' = Sigma. On a GPU it is a kernel of its own.
     """
+    if alone_on_gpu(x):
+        from pegasus_jax import moments_kernel as kernel  # what it needs of JAX is for GPUs
+
+        if kernel.suits(x):
+            return kernel.fused(_match)(x, z)
+    return _match(x, z)
+
+
+def _match(x: Array, z: Array) -> Array:
     mean, cov = mean_and_cov(x)
     return mean + z @ cholesky(cov).T
 

@@ -103,7 +103,7 @@ class Program:
         layout = {} if over is None else {"out_shardings": mesh.over_seeds(over)}
         self.parts = {
             name: Jitted(
-                over_seeds(function, axes, seeds=seeds),
+                over_seeds(function, axes, seeds=seeds, over=over),
                 kept=shelf and shelf.with_name(f"{shelf.name}-{name}{self.chunk if name == 'search' else ''}"),
                 compiler_options=compiler_options(LASTING if name in LONG else BRIEFLY, experiment.dynamics),
                 **layout,
@@ -178,12 +178,12 @@ def share_processors(seeds: int, particles: int | None = None) -> None:
 def compiler_options(by_platform: dict[str, dict[str, Any]], dynamics: Dynamics | None = None) -> dict[str, Any]:
     """The compiler's options for the platform at hand: those that its version has, and XLA_FLAGS does not speak of.
 
-    Where the `dynamics` bring kernels of their own, none runs abreast of others: it has not been tried.
+    Where the `dynamics` bring kernels of their own, none runs abreast of others (docs/decisions/0013).
     """
     wanted, told = by_platform.get(jax.default_backend(), {}), os.environ.get("XLA_FLAGS", "")
-    untried = ABREAST if dynamics is not None and dynamics.particles else {}
+    doubted = ABREAST if dynamics is not None and dynamics.particles else {}
     return {
-        name: value for name, value in wanted.items() if name not in told and name not in untried and _has(name, value)
+        name: value for name, value in wanted.items() if name not in told and name not in doubted and _has(name, value)
     }
 
 
@@ -196,11 +196,15 @@ def _has(name: str, value: Any) -> bool:
     return True
 
 
-def over_seeds(function: Callable[..., Any], axes: tuple[int | None, ...], *, seeds: int) -> Callable[..., Any]:
+def over_seeds(
+    function: Callable[..., Any], axes: tuple[int | None, ...], *, seeds: int, over: Mesh | None = None
+) -> Callable[..., Any]:
     """The function over a leading axis of `seeds`; one seed is the function itself, so that its numbers do not change.
 
-    `axes` is 0 for an argument with that axis, None for one that all seeds share.
+    `axes` is 0 for an argument with that axis, None for one that all seeds share. With a mesh the seeds are shared out.
     """
+    if over is not None and over.shape[mesh.PARTICLES] == 1:
+        return mesh.each_its_own(over_seeds(function, axes, seeds=seeds // over.shape[mesh.SEEDS]), over, axes, 0)
     if seeds > 1:
         return jax.vmap(function, axes, spmd_axis_name=mesh.SEEDS)
 

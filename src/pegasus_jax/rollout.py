@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenarios
 
-# Platform -> steps of the time loop compiled as one, where a model has no kernel of its own. Each round of a loop costs
-# a GPU copies and launches (docs/decisions/0013); a processor would only compile longer.
-UNROLL = {"gpu": 5}
+# Platform -> steps of the time loop compiled as one. Each round of a loop costs a GPU copies and launches
+# (docs/decisions/0013); a processor would only compile longer.
+UNROLL = {"gpu": 25}
 
 
 class NoiseUse(NamedTuple):
@@ -64,7 +64,7 @@ def rollout(
     start = scenarios.start
     times = jnp.arange(scenarios.match.shape[0])
     draws = (times, scenarios.sensor, scenarios.match)
-    unroll = 1 if dynamics.particles else UNROLL.get(jax.default_backend(), 1)
+    unroll = UNROLL.get(jax.default_backend(), 1)
     _, (x, u, std, seen) = jax.lax.scan(step, (start, jnp.zeros_like(start)), draws, unroll=unroll)
     return Rollout(jnp.concatenate([start[None], x]), u, std, seen)
 

@@ -3,6 +3,7 @@
 import json
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,12 +41,16 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
     set_precision(config)
     experiment = build(config)
     over = mesh.evenly(len(seeds))
-    each = partial(jax.vmap, spmd_axis_name=mesh.SEEDS)
+
+    def each(function: Callable[..., Any], given: Any, returned: Any = 0) -> Callable[..., Any]:
+        vmapped = jax.vmap(function, given, returned)
+        return vmapped if over is None else mesh.each_its_own(vmapped, over, given, returned)
+
     # What lies where: a seed's own on the devices for seeds, the number of the trial on all.
     own, all_the_same = (None, None) if over is None else (mesh.over_seeds(over), mesh.shared(over))
     laid_out = RunState(own, own, own, own, all_the_same)  # type: ignore[arg-type]
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
-    states = jax.jit(each(experiment.init, out_axes=SEEDS), out_shardings=laid_out)(keys)
+    states = jax.jit(each(experiment.init, (0,), SEEDS), out_shardings=laid_out)(keys)
     began = time.monotonic()
     one = each(lambda state: trial(state, experiment), (SEEDS,), (SEEDS, 0))
     lowered = jax.jit(one, out_shardings=(laid_out, own)).lower(states)

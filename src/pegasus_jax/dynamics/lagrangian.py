@@ -10,6 +10,7 @@ import numpy as np
 
 from pegasus_jax.angles import encode
 from pegasus_jax.mechanics import GREATEST_CHANGE, GREATEST_SPEED, LEAST_MASS, substituted
+from pegasus_jax.mesh import alone_on_gpu
 from pegasus_jax.noisy import Head, Masks, noisy
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 from pegasus_jax.whiten import whitener
@@ -21,6 +22,7 @@ DEGREES_OF_FREEDOM = 4.0
 
 # Runge and Kutta's four stages: how far ahead of the step's start each looks, by the slope before, and its share.
 AHEAD, SHARE = np.array([0, 1 / 2, 1 / 2, 1]), np.array([1, 2, 2, 1]) / 6
+UNROLL = {"gpu": 4}  # platform -> stages compiled as one, as in `rollout`
 
 
 class Units(NamedTuple):
@@ -126,7 +128,7 @@ def lagrangian(
             return jnp.stack([dt * v, units.speed * acceleration(belief, masks, q, v / units.speed, u)])
 
         def step(now: Array) -> Array:
-            """One step of the integration; its stages in a loop, because four copies would take longer to compile."""
+            """One step of the integration; its stages in a loop, because four copies take longer to compile."""
 
             def stage(carry: tuple[Array, Array], weights: tuple[Array, Array]) -> tuple[tuple[Array, Array], None]:
                 slope, total = carry
@@ -136,7 +138,8 @@ def lagrangian(
 
             weights = jnp.asarray(AHEAD, now.dtype), jnp.asarray(SHARE, now.dtype)
             nothing = jnp.zeros_like(now)
-            (_, total), _ = jax.lax.scan(stage, (nothing, nothing), weights)
+            unroll = UNROLL.get(jax.default_backend(), 1)
+            (_, total), _ = jax.lax.scan(stage, (nothing, nothing), weights, unroll=unroll)
             now = now + total
             return now.at[1].set(within(now[1], GREATEST_SPEED * units.speed))
 
@@ -181,11 +184,6 @@ def lagrangian(
         apply=predict,
         particles=particles,
     )
-
-
-def alone_on_gpu(x: Array) -> bool:
-    """Whether a kernel of ours may compute in x's place: the compiler splits its own over devices, but not ours."""
-    return jax.default_backend() == "gpu" and jax.device_count() == 1 and x.dtype == jnp.float32
 
 
 def within(v: Array, limit: Array | float) -> Array:
