@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 
-from pegasus_jax import moments
+from pegasus_jax import moments, settings
 from pegasus_jax import moments_kernel as kernel
+from pegasus_jax.build import build
 from pegasus_jax.types import Array
 
 
@@ -74,6 +75,20 @@ def test_matching_takes_it_where_there_is_one_gpu(monkeypatch: pytest.MonkeyPatc
         many = jnp.ones(shape)
         assert moments.match(many, many).shape == shape
     assert len(calls) == 1, "too many dimensions, and too many particles"
+
+
+@pytest.mark.parametrize(("model", "takes_it"), [("log_normal", True), ("lagrangian", False)])
+def test_a_model_with_kernels_of_its_own_does_without(
+    model: str, takes_it: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    calls = []
+    real = kernel.fused
+    monkeypatch.setattr(kernel, "fused", lambda plain: calls.append(plain) or real(plain))
+    monkeypatch.setattr(moments, "alone_on_gpu", lambda x: True)
+    words = {"task": "cartpole", "model": model, "search.steps": "2", "search.particles": "10"}
+    experiment = build.__wrapped__(settings.parse(words))
+    jax.eval_shape(lambda key: experiment.search(experiment.init(key), 1), jax.random.key(0))
+    assert bool(calls) == takes_it
 
 
 def test_compiles_for_a_gpu_that_is_not_there() -> None:

@@ -56,17 +56,19 @@ def mean_and_cov(x: Array) -> tuple[Array, Array]:
 def match(x: Array, z: Array) -> Array:
     """Particles [K, D] redrawn as mean + L z from the Gaussian fitted to x [K, D]; z [K, D] is standard normal.
 
-    Alg. 3 line 14, whose Sigma z is a slip of notation for L z with L L' = Sigma. On a GPU it is a kernel of its own.
+    Alg. 3 line 14, whose Sigma z is a slip of notation for L z with L L' = Sigma. On a GPU it is a kernel of its own,
+    which has a gradient but no forward derivative.
     """
     if alone_on_gpu(x):
         from pegasus_jax import moments_kernel as kernel  # what it needs of JAX is for GPUs
 
         if kernel.suits(x):
-            return kernel.fused(_match)(x, z)
-    return _match(x, z)
+            return kernel.fused(match_plain)(x, z)
+    return match_plain(x, z)
 
 
-def _match(x: Array, z: Array) -> Array:
+def match_plain(x: Array, z: Array) -> Array:
+    """`match` by JAX's compiler on every platform; of models with kernels of their own (docs/decisions/0013)."""
     mean, cov = mean_and_cov(x)
     return mean + z @ cholesky(cov).T
 
