@@ -32,7 +32,7 @@ def block(particles: int) -> int:
 
 
 def fused(plain: Callable[[Array, Array], Array], *, interpret: bool = False) -> Callable[[Array, Array], Array]:
-    """`plain`, which is `moments.match`, as kernels; `interpret` runs them without a GPU.
+    """`plain`, which is `moments.match_plain`, as kernels; `interpret` runs them without a GPU.
 
     The gradient by z, which no search asks for, is that of `plain`.
     """
