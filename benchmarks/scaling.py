@@ -36,7 +36,7 @@ from pegasus_jax.config import Config
 from pegasus_jax.program import LASTING, Jitted, compiler_options, over_seeds, placed
 from pegasus_jax.record import about
 from pegasus_jax.trial import EVALUATE, trial_key
-from pegasus_jax.types import Array, Dynamics, Experiment, RunState
+from pegasus_jax.types import Array, Experiment, RunState
 
 Row = dict[str, Any]
 Report = Callable[[str, Row], None]  # (the row's name, the row) -> printed and on disk
@@ -46,12 +46,10 @@ COLLECTIVE = re.compile(
 EPISODES = 20  # of evaluation
 
 
-def spread(
-    function: Callable[..., Any], axes: tuple[int | None, ...], seeds: int, over: Mesh | None, dynamics: Dynamics
-) -> Jitted:
+def spread(function: Callable[..., Any], axes: tuple[int | None, ...], seeds: int, over: Mesh | None) -> Jitted:
     """The function over seeds, and these over a mesh, as `pegasus-train seeds= mesh=` compiles it."""
     layout = {} if over is None else {"out_shardings": mesh.over_seeds(over)}
-    how = compiler_options(LASTING, dynamics)
+    how = compiler_options(LASTING)
     return Jitted(over_seeds(function, axes, seeds=seeds, over=over), compiler_options=how, **layout)
 
 
@@ -73,7 +71,7 @@ def study(config: Config, seeds: int, over: Mesh | None, report: Callable[[Row],
     """Seconds of every trial of a study, and of its parts; reported after each trial."""
     set_precision(config)
     experiment = build(config, over)
-    prepared = partial(spread, axes=(0,), seeds=seeds, over=over, dynamics=experiment.dynamics)
+    prepared = partial(spread, axes=(0,), seeds=seeds, over=over)
     parts = {name: prepared(function) for name, function in parts_of(experiment).items()}
     states = prepared(experiment.init)(on_devices(jax.vmap(jax.random.key)(jnp.arange(seeds)), over))
     devices = 1 if over is None else over.devices.size
@@ -126,7 +124,7 @@ def of_devices(options: dict[str, str], words: dict[str, str], report: Report) -
     config = settings.parse({"task": "cartpole", "model": "log_normal", "trials": "3", **words})
     (seeds,) = numbers(options, "seeds", "100")
     first = None
-    for count in numbers(options, "devices", "1,2,4"):
+    for count in sorted(numbers(options, "devices", "1,2,4")):
         name = f"{count} devices"
         row = study(config, seeds, mesh.mesh(count, 1), partial(report, name))
         seconds = statistics.median(row["trial_s"][1:] or row["trial_s"])  # the first one warms devices up
@@ -145,7 +143,7 @@ def of_particles(options: dict[str, str], words: dict[str, str], report: Report)
     for count in numbers(options, "devices", "1,4"):
         over = mesh.mesh(1, count)
         experiment = compose(config, small.task, mesh=over)
-        search = spread(partial(experiment.search, steps=steps), (0, None), 1, over, experiment.dynamics)
+        search = spread(partial(experiment.search, steps=steps), (0, None), 1, over)
         arguments: tuple[Any, ...] = (states, jnp.int32(1))  # not 0, which would also weigh a fresh policy
         if over is not None:
             arguments = placed(states, mesh.over_seeds(over)), placed(jnp.int32(1), mesh.shared(over))

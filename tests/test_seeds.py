@@ -93,10 +93,7 @@ def test_a_gpu_is_told_how_to_run_loops_unless_the_user_says(monkeypatch: pytest
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     whole, abreast = "xla_gpu_enable_command_buffer", "xla_gpu_command_buffer_scheduling_mode"
     assert {*programs.compiler_options(programs.LASTING)} == {whole, abreast}
-    dynamics = compose(tiny(), cart()).dynamics
-    assert {*programs.compiler_options(programs.BRIEFLY, dynamics)} == {whole, abreast}
-    own_kernels = dynamics._replace(particles=lambda apply: apply)
-    assert {*programs.compiler_options(programs.BRIEFLY, own_kernels)} == {whole}
+    assert {*programs.compiler_options(programs.BRIEFLY)} == {whole, abreast}
     monkeypatch.setenv("XLA_FLAGS", f"--{whole}=")
     assert {*programs.compiler_options(programs.LASTING)} == {abreast}
 

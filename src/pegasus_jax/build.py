@@ -150,7 +150,7 @@ def search_of(
     # A particle's cost is 1 / K of the objective.
     limit = None if search.limit is None else search.limit / search.particles
     ends: dict[str, Any] = dict(aggregate=discounted(search, aggregate), truncate=search.truncate)
-    match = (moments.match_plain if dynamics.particles else moments.match) if search.match else moments.keep
+    match = moments.match if search.match else moments.keep
     costs = costs_of(search, task)
     # The last part of a search is for refining: no matching, each particle's own cost, at its own width.
     refine = round((1 - search.refine) * search.steps) if search.refine else None

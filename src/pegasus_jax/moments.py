@@ -68,7 +68,7 @@ def match(x: Array, z: Array) -> Array:
 
 
 def match_plain(x: Array, z: Array) -> Array:
-    """`match` by JAX's compiler on every platform; of models with kernels of their own (docs/decisions/0013)."""
+    """`match` as JAX's compiler has it, on every platform."""
     mean, cov = mean_and_cov(x)
     return mean + z @ cholesky(cov).T
 

@@ -18,7 +18,7 @@ from jax.sharding import Mesh, NamedSharding
 from pegasus_jax import mesh
 from pegasus_jax.compiled import program
 from pegasus_jax.record import processors
-from pegasus_jax.types import Dynamics, Experiment
+from pegasus_jax.types import Experiment
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 
@@ -105,7 +105,7 @@ class Program:
             name: Jitted(
                 over_seeds(function, axes, seeds=seeds, over=over),
                 kept=shelf and shelf.with_name(f"{shelf.name}-{name}{self.chunk if name == 'search' else ''}"),
-                compiler_options=compiler_options(LASTING if name in LONG else BRIEFLY, experiment.dynamics),
+                compiler_options=compiler_options(LASTING if name in LONG else BRIEFLY),
                 **layout,
             )
             for name, (function, axes) in functions.items()
@@ -175,16 +175,10 @@ def share_processors(seeds: int, particles: int | None = None) -> None:
         os.environ.setdefault("NPROC", "1")  # what XLA asks for the number of its threads
 
 
-def compiler_options(by_platform: dict[str, dict[str, Any]], dynamics: Dynamics | None = None) -> dict[str, Any]:
-    """The compiler's options for the platform at hand: those that its version has, and XLA_FLAGS does not speak of.
-
-    Where the `dynamics` bring kernels of their own, none runs abreast of others (docs/decisions/0013).
-    """
+def compiler_options(by_platform: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The compiler's options for the platform at hand: those that its version has, and XLA_FLAGS does not speak of."""
     wanted, told = by_platform.get(jax.default_backend(), {}), os.environ.get("XLA_FLAGS", "")
-    doubted = ABREAST if dynamics is not None and dynamics.particles else {}
-    return {
-        name: value for name, value in wanted.items() if name not in told and name not in doubted and _has(name, value)
-    }
+    return {name: value for name, value in wanted.items() if name not in told and _has(name, value)}
 
 
 @cache

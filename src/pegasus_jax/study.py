@@ -54,7 +54,7 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
     began = time.monotonic()
     one = each(lambda state: trial(state, experiment), (SEEDS,), (SEEDS, 0))
     lowered = jax.jit(one, out_shardings=(laid_out, own)).lower(states)
-    how = compiler_options(LASTING, experiment.dynamics)
+    how = compiler_options(LASTING)
     program = lowered.compile(compiler_options=how)
     # A program of its own, so that looking changes no number.
     infos = lowered.out_info[1] if own is None else described(lowered.out_info[1], own)
