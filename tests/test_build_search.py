@@ -35,12 +35,14 @@ def eagerly(function):
     return call
 
 
-def searcher(gain=-0.5, **search):
+def searcher(gain=-0.5, scatter=0.0, **search):
     """An experiment under a config, its first state, and a one-step search from it."""
     chosen = dataclasses.replace(
         tiny(), search=config.Search(**{"steps": 1, "particles": 5, "cost": "particles", "widen": 1.0, **search})
     )
-    policy = linear_policy(2, 1)._replace(init=lambda key: gain * jnp.array([[1.0, 1.6]]))
+    policy = linear_policy(2, 1)._replace(
+        init=lambda key: gain * jnp.array([[1.0, 1.6]]) + scatter * jax.random.normal(key, (1, 2))
+    )
     exp = compose(chosen, cart(horizon=2), dynamics=known(PENDULUM, noise_std=0.2), policy=policy)
     return exp, exp.init(jax.random.key(0)), eagerly(exp.search)
 
@@ -83,23 +85,37 @@ HELD = dict(steps=4, period=Period(0, 0, 0, 0, 0))  # the same scenarios for eve
 ALONE = dict(match=False, restart=False, **HELD)
 
 
-def test_a_search_that_lost_its_way_refines_the_policy_it_was_given():
-    """With steps of 10 the matched half is of no use. What refines has no matching, and each particle's own cost."""
+def test_a_search_that_lost_its_way_refines_and_ends_with_the_policy_it_was_given():
+    """With steps of 10 neither half is of use. What refines has no matching, and each particle's own cost."""
     _, state, run = searcher(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
     (after, info), (_, _, alone) = run(state), searcher(learning_rate=1e-30, **ALONE)
-    np.testing.assert_allclose(info.objective[2], alone(state)[1].objective[0], rtol=1e-5)
-    assert np.any(after.policy.params != state.policy.params)
+    np.testing.assert_allclose(info.objective[1:], alone(state)[1].objective[0], rtol=1e-5)
+    assert np.array_equal(after.policy.params, state.policy.params)
 
 
 def test_a_search_that_found_a_better_policy_refines_that():
     better = dict(cost="matched", widen=1.0, learning_rate=0.02)
     _, state, run = searcher(gain=-0.1, refine=0.5, **better, **HELD)
-    _, info = run(state)
+    after, info = run(state)
     exp, _, _ = searcher(gain=-0.1, **better, **HELD)
     found, _ = eagerly(partial(exp.search, steps=2))(state)
     _, _, alone = searcher(learning_rate=1e-30, **ALONE)
     np.testing.assert_allclose(info.objective[2], alone(found)[1].objective[0], rtol=1e-5)
-    assert info.objective[2] < alone(state)[1].objective[0]
+    assert alone(after)[1].objective[0] < info.objective[2] < alone(state)[1].objective[0]
+
+
+def test_of_several_that_lost_their_way_the_best_that_was_given_goes_on():
+    lost = dict(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
+    _, state, run = searcher(scatter=0.3, starts=3, **lost)
+    after, info = run(state)
+    members = after.policy.optimizer.params
+    assert np.array_equal(members[0], state.policy.params)
+    _, begun, alone = searcher(learning_rate=1e-30, **ALONE)
+    own = [begun._replace(policy=begun.policy._replace(params=params)) for params in members]
+    costs = [float(alone(one)[1].objective[0]) for one in own]
+    assert len(set(costs)) == 3
+    assert np.array_equal(after.policy.params, members[int(np.argmin(costs))])
+    np.testing.assert_allclose(info.objective[-1], min(costs), rtol=1e-5)
 
 
 def test_what_refines_is_imagined_as_it_was_searched():

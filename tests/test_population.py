@@ -44,7 +44,7 @@ def descent():
 def found(own, others, key=0, calls=1):
     """(learner, info) of a search of 60 iterations in so many calls."""
     fresh = lambda key: jax.random.choice(key, jnp.asarray(others))  # noqa: E731
-    searcher = best_of(descent(), fresh, starts=STARTS, last=STEPS)
+    searcher = best_of(descent(), fresh, starts=STARTS, window=STEPS // 20)
     learner = Learner(jnp.float32(own), searcher.init(jnp.float32(own)))
     run, info = jax.jit(partial(searcher.run, steps=STEPS // calls)), None
     for call in range(calls):
@@ -92,7 +92,7 @@ def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_
 
     def members(lasting):
         """After a search of 3 iterations, and after one more, with another key."""
-        searcher = best_of(descent(), fresh, starts=STARTS, last=3, lasting=lasting)
+        searcher = best_of(descent(), fresh, starts=STARTS, window=1, lasting=lasting)
         learner = Learner(jnp.float32(0.3), searcher.init(jnp.float32(0.3)))
         first, _ = searcher.run(jax.random.key(0), learner, DEEPER, first=0, earlier=0, steps=3)
         second, _ = searcher.run(jax.random.key(1), first, DEEPER, first=0, earlier=3, steps=3)

@@ -92,7 +92,9 @@ def test_no_word_gives_the_defaults():
 def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorithms():
     own = settings.parse({})
     assert own.model == Lagrangian(substeps=1)
-    assert own == settings.parse({"task": "cartpole", "model": "lagrangian", "algorithm": "pegasus"})
+    named = settings.parse({"task": "cartpole", "model": "lagrangian", "algorithm": "pegasus"})
+    assert own == dataclasses.replace(named, search=Search(balanced=True, widen=2.0, refine=0.5))
+    assert named.search == Search()
     assert settings.parse({"task": "cartpole", "model": "log_normal"}).model == BNN()
     for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}, {"task": "swimmer_corkscrew"}):
         assert settings.parse(words) == settings.parse({"model": "log_normal", **words})

@@ -179,17 +179,17 @@ def search_of(
             stage=jnp.asarray,
             pace=step,
             settled=narrow if refine is None else refine,
-            refine=refine,
+            turns=() if refine is None else (refine, search.steps),
         ),
     )
     if search.best:
         searcher = keeping_best(searcher, search.steps)
     if search.starts > 1:
         lasting = search.anneal > 1  # one course for all searches: who began late would be behind
-        searcher = best_of(searcher, policy.init, starts=search.starts, last=search.steps, lasting=lasting)
-    seen_last = (
-        match if refine is None else moments.keep
-    )  # a refined policy is good for particles, not for their Gaussian
+        window = 1 if search.refine else max(1, search.steps // 20)  # what refines may end with another than its last
+        searcher = best_of(searcher, policy.init, starts=search.starts, window=window, lasting=lasting)
+    # A refined policy is good for particles, not for their Gaussian.
+    seen_last = match if refine is None else moments.keep
     return searcher, partial(imagined, **pieces, match=seen_last, blocks=blocks, cost=task.cost)
 
 

@@ -19,7 +19,7 @@ class Course(NamedTuple):
     stage: Schedule | None = None  # what the objective is told of the iteration
     pace: Schedule | None = None  # a factor of the step
     settled: float = 0  # the iteration from which the objective is what the search is for
-    refine: int | None = None  # that at which it goes back to the parameters it was given, unless it found better ones
+    turns: tuple[int, ...] = ()  # after so many it goes back to what it was given, unless it found better parameters
 
     def at(self, i: Array | int) -> tuple[Array, ...]:
         """What the objective of iteration i is told beyond policy parameters, belief and scenarios."""

@@ -12,17 +12,16 @@ FRESH = 2**31 - 1  # what a search's key is folded with for fresh policies; for 
 
 
 def best_of(
-    searcher: Searcher, fresh: Callable[[Key], Params], *, starts: int, last: int, lasting: bool = False
+    searcher: Searcher, fresh: Callable[[Key], Params], *, starts: int, window: int, lasting: bool = False
 ) -> Searcher:
     """The searcher that searches from `starts` policies under the same scenarios, all of them until the trial ends.
 
     The first is the policy it is given, the others are `fresh` at iteration 0 of each trial; or of the first search
     where they are `lasting`, and then each goes on from trial to trial, whichever is the best. All begin a trial with a
     new optimiser, so `begin` is not asked. The learner's parameters are always those of the member with the lowest
-    mean objective over the last twentieth of a search of `last` iterations, or as many as there were. Its optimiser is
-    all members: a `Learner` [starts, ...].
+    mean objective over the last `window` iterations, or as many as there were. Its optimiser is all members: a
+    `Learner` [starts, ...].
     """
-    window = max(1, last // 20)
 
     def init(params: Params) -> Learner:
         members = jax.tree.map(lambda leaf: jnp.stack([leaf] * starts), params)

@@ -43,7 +43,7 @@ def remembering(optimizer: optax.GradientTransformation) -> optax.GradientTransf
 class SearchInfo(NamedTuple):
     """How a search went, iteration by iteration."""
 
-    objective: Array  # [steps]
+    objective: Array  # [steps]; of an iteration after which it turned, that of the policy it went on with
     gradient_norm: Array  # [steps] before clipping
     skipped: Array  # [] updates skipped because a gradient was not finite
 
@@ -113,7 +113,7 @@ def optimise(
     """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 19).
 
     One call of n steps and two calls of n/2, the second with first=n/2, do the same. With a stage in the `course`, the
-    objective takes one more argument, the stage of the iteration; a course that refines needs a `started` optimiser.
+    objective takes one more argument, the stage of the iteration; a course with turns needs a `started` optimiser.
     The course counts from `earlier`: the iterations of the searches before this one, where it goes on with theirs.
     """
     first = jnp.asarray(first, jnp.int32)
@@ -121,8 +121,6 @@ def optimise(
 
     def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], tuple[Array, Array]]:
         learner, scenarios = carry[0], unpacked(carry[1], like=drawn)
-        if course.refine is not None:
-            learner = jax.lax.cond(i == course.refine, better, lambda learner, *_: learner, learner, scenarios, i)
         value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios, *course.at(earlier + i))
         # A wider cost is a lower one: its value says nothing about which parameters are best.
         known = jnp.where(i < course.settled, jnp.inf, value) if course.settled else value
@@ -131,21 +129,26 @@ def optimise(
             updates = optax.tree.scale(course.pace(earlier + i), updates)
         learner = Learner(optax.apply_updates(learner.params, updates), state)
         scenarios = redraw(key, i + 1, scenarios, belief)
+        if course.turns:
+            turning = jnp.any(i + 1 == jnp.asarray(course.turns))
+            onwards = lambda learner, value, *_: (learner, value)  # noqa: E731
+            learner, value = jax.lax.cond(turning, better, onwards, learner, value, scenarios, i + 1)
         return (learner, packed(scenarios)), (value, optax.tree.norm(gradient))
 
-    def better(learner: Learner, scenarios: Scenarios, i: Array) -> Learner:
-        """The learner at its parameters or at those it was given; a tie, or NaN, goes to these."""
+    def better(learner: Learner, _: Array, scenarios: Scenarios, i: Array) -> tuple[Learner, Array]:
+        """The learner at its parameters or at those it was given, and what it costs; a tie, or NaN, goes to these."""
         old = optax.tree.get(learner.optimizer, "start")
         both = jax.tree.map(lambda *leaves: jnp.stack(leaves), old, learner.params)
         of_old, of_new = jax.lax.map(lambda params: objective(params, belief, scenarios, *course.at(i)), both)
-        return learner._replace(params=jax.tree.map(partial(jnp.where, of_new < of_old), learner.params, old))
+        kept = jax.tree.map(partial(jnp.where, of_new < of_old), learner.params, old)
+        return learner._replace(params=kept), jnp.where(of_new < of_old, of_new, of_old)
 
     drawn = draw(key, first, belief)
     given = learner.params
     if begin is not None:
         stage = course.at(earlier)
         learner = at_first(first, begin, learner, lambda params: objective(params, belief, drawn, *stage))
-    if course.refine is not None:
+    if course.turns:
         kept = jax.tree.map(partial(jnp.where, first == 0), given, optax.tree.get(learner.optimizer, "start"))
         learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, start=kept))
     before = skipped(learner.optimizer)
@@ -184,7 +187,7 @@ def particles(
     course: Course = Course(),
 ) -> Searcher:
     """The searcher that follows the gradient of `objective` under scenarios drawn from `blocks`, held for `period`."""
-    optimizer = guarded(optimizer if course.refine is None else started(optimizer))
+    optimizer = guarded(started(optimizer) if course.turns else optimizer)
     pieces: dict[str, Any] = dict(
         draw=partial(draw, blocks=blocks, period=period),
         redraw=partial(redraw, blocks=blocks, period=period),

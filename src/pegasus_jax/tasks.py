@@ -92,9 +92,9 @@ _LEGS: dict[int, dict[str, Any]] = {
 
 
 # The model with which a task is learned best, where it is not the default one, and what is changed with it:
-# docs/decisions/0006, 0008 and 0009.
+# docs/decisions/0006, 0008, 0009 and 0014.
 BEST: dict[str, tuple[str, dict[str, Any]]] = {
-    "cartpole": ("lagrangian", {}),
+    "cartpole": ("lagrangian", {"search.balanced": True, "search.widen": 2.0, "search.refine": 0.5}),
     "double_cartpole": (
         "lagrangian",
         {
