@@ -15,7 +15,7 @@ from pegasus_jax import cost, moments, scenarios
 from pegasus_jax.course import Course, narrowing, pace, reheated
 from pegasus_jax.fit import guarded
 from pegasus_jax.rollout import NoiseUse
-from pegasus_jax.search import keeping_best, objective, optimise, remembering
+from pegasus_jax.search import keeping_best, objective, optimise, remembering, started
 from pegasus_jax.types import Learner, Period, Scenarios, Searcher
 from probes import (
     PENDULUM,
@@ -234,6 +234,23 @@ def test_the_search_is_gradient_descent_on_the_scenarios_of_each_iteration():
     first = distance(jnp.ones(3), 1.0, follow(jax.random.key(7), 0, None))
     np.testing.assert_allclose(info.objective[0], first, rtol=1e-6)
     np.testing.assert_allclose(info.gradient_norm[0], 2 * np.sqrt(first), rtol=1e-5)
+
+
+@pytest.mark.parametrize("calls", [1, 2, 3])
+def test_a_search_that_loses_what_it_found_ends_with_what_it_had_at_its_turn(calls):
+    """Three steps find something better than what was given, three of ten thousand times the size lose it again."""
+    optimizer = guarded(started(optax.sgd(0.1)))
+    course = Course(turns=(3, 6), pace=lambda i: jnp.where(i < 3, 1.0, 1e4))
+    still = dict(draw=lambda *_: jnp.zeros(3), redraw=lambda key, step, held, belief: held, optimizer=optimizer)
+    run = jax.jit(partial(optimise, **still, objective=distance, course=course, steps=6 // calls))
+    learner, values = begin(optimizer), []
+    for call in range(calls):
+        learner, info = run(jax.random.key(7), learner, 1.0, first=call * (6 // calls))
+        values += info.objective.tolist()
+    np.testing.assert_allclose(learner.params, 0.8**3, rtol=1e-5)
+    np.testing.assert_allclose(values[:4], 3 * np.power(0.64, [0, 1, 3, 3]), rtol=1e-5)
+    assert values[4] > 1e6
+    np.testing.assert_allclose(values[5], values[3], rtol=1e-5)
 
 
 def test_the_width_narrows_geometrically_and_stays():

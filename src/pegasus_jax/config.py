@@ -231,7 +231,7 @@ class Search:
     discount: float = setting(1.0, "weight of a later step against the one before")
     cost: str = setting("matched", "expected one of the matched Gaussian, or of each of the particles: particles")
     refine: float = setting(
-        0.0, "last part of a search: refines what it found or the old policy, and ends with the best of them"
+        0.0, "last part of a search: refines what it found or the old policy, and ends with the best it had"
     )
     widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
     anneal: int = setting(1, "so many trials' searches are one to widen and decay, which end then; 1: each is its own")

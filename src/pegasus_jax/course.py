@@ -19,7 +19,7 @@ class Course(NamedTuple):
     stage: Schedule | None = None  # what the objective is told of the iteration
     pace: Schedule | None = None  # a factor of the step
     settled: float = 0  # the iteration from which the objective is what the search is for
-    turns: tuple[int, ...] = ()  # after so many it goes back to what it was given, unless it found better parameters
+    turns: tuple[int, ...] = ()  # after so many it goes back to where it started or last turned, unless it found better
 
     def at(self, i: Array | int) -> tuple[Array, ...]:
         """What the objective of iteration i is told beyond policy parameters, belief and scenarios."""

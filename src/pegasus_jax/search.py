@@ -85,7 +85,7 @@ class Started(NamedTuple):
 
 
 def started(optimizer: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
-    """The optimiser, which also keeps the parameters that a search started from; see `optimise`."""
+    """The optimiser, which also keeps the parameters that a search, or its part after a turn, started from."""
     optimizer = optax.with_extra_args_support(optimizer)
 
     def update(updates: Params, state: Any, params: Params = None, **extra: Any) -> tuple[Params, Any]:
@@ -130,18 +130,22 @@ def optimise(
         learner = Learner(optax.apply_updates(learner.params, updates), state)
         scenarios = redraw(key, i + 1, scenarios, belief)
         if course.turns:
-            turning = jnp.any(i + 1 == jnp.asarray(course.turns))
+            turns = jnp.any(i + 1 == jnp.asarray(course.turns))
             onwards = lambda learner, value, *_: (learner, value)  # noqa: E731
-            learner, value = jax.lax.cond(turning, better, onwards, learner, value, scenarios, i + 1)
+            learner, value = jax.lax.cond(turns, better, onwards, learner, value, scenarios, i + 1)
         return (learner, packed(scenarios)), (value, optax.tree.norm(gradient))
 
     def better(learner: Learner, _: Array, scenarios: Scenarios, i: Array) -> tuple[Learner, Array]:
-        """The learner at its parameters or at those it was given, and what it costs; a tie, or NaN, goes to these."""
+        """The learner at its parameters, or at those it was given or had at the turn before, and what it costs.
+
+        A tie, or NaN, goes to the older ones.
+        """
         old = optax.tree.get(learner.optimizer, "start")
         both = jax.tree.map(lambda *leaves: jnp.stack(leaves), old, learner.params)
         of_old, of_new = jax.lax.map(lambda params: objective(params, belief, scenarios, *course.at(i)), both)
         kept = jax.tree.map(partial(jnp.where, of_new < of_old), learner.params, old)
-        return learner._replace(params=kept), jnp.where(of_new < of_old, of_new, of_old)
+        optimizer = optax.tree.set(learner.optimizer, start=kept)
+        return Learner(kept, optimizer), jnp.where(of_new < of_old, of_new, of_old)
 
     drawn = draw(key, first, belief)
     given = learner.params
