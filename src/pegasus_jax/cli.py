@@ -40,7 +40,7 @@ examples
   pegasus-train task=swimmer_corkscrew legs=6
   pegasus-train task=gym env=Pendulum-v1 cost=mymodule:cost horizon=40
   pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
-  pegasus-train resume=runs/demo trials=20 search.refine=0.5
+  pegasus-train resume=runs/demo trials=20 search.steps=2000
 
 Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, pegasus-play RUN, or
 tensorboard --logdir RUN/tensorboard.
