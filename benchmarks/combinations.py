@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from benchmarks.growth import experience
 from benchmarks.study import RESULTS
 from benchmarks.timing import compiled, in_turn, matmul
+from benchmarks.workloads import ALIKE
 from pegasus_jax import settings
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.record import about
@@ -27,7 +28,7 @@ STEPS, PRODUCTS = 4, 500  # in one call
 PILCO = [
     {"model": model, "policy": policy, "algorithm": "pilco"} for model in ("ssgp", "gp") for policy in ("rbf", "linear")
 ]
-COMBINATIONS = [{"model": model, "policy": policy} for policy in POLICIES for model in MODELS] + PILCO
+COMBINATIONS = [{"model": model, "policy": policy, **ALIKE} for policy in POLICIES for model in MODELS] + PILCO
 
 
 def step(words: dict[str, str], repeats: int) -> dict[str, float]:

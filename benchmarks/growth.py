@@ -21,6 +21,7 @@ import jax.numpy as jnp
 
 from benchmarks.suite import RESULTS
 from benchmarks.timing import compiled, in_turn, matmul, summary
+from benchmarks.workloads import ALIKE
 from pegasus_jax import dataset, settings
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.record import about
@@ -29,9 +30,9 @@ from pegasus_jax.types import Batch, Dataset, Trajectory
 PILCO = {"policy": "rbf", "algorithm": "pilco"}
 # name: (what it is, the most rows it is measured with: analytic moments of an exact process take minutes beyond)
 METHODS: dict[str, tuple[dict[str, str], int]] = {
-    "log_normal": ({"model": "log_normal"}, 10**6),
-    "ssgp": ({"model": "ssgp"}, 10**6),
-    "gp": ({"model": "gp"}, 10**6),
+    "log_normal": ({"model": "log_normal", **ALIKE}, 10**6),
+    "ssgp": ({"model": "ssgp", **ALIKE}, 10**6),
+    "gp": ({"model": "gp", **ALIKE}, 10**6),
     "pilco, ssgp": ({"model": "ssgp", **PILCO}, 10**6),
     "pilco, gp": ({"model": "gp", **PILCO}, 200),
 }

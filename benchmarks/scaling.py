@@ -29,7 +29,7 @@ from jax.sharding import Mesh
 
 from benchmarks.study import RESULTS
 from benchmarks.timing import summary
-from benchmarks.workloads import workload
+from benchmarks.workloads import ALIKE, workload
 from pegasus_jax import mesh, settings
 from pegasus_jax.build import build, compose, set_precision
 from pegasus_jax.config import Config
@@ -114,14 +114,14 @@ def peaks(devices: int) -> list[float]:
 
 def of_seeds(options: dict[str, str], words: dict[str, str], report: Report) -> None:
     """The whole experiment, one device."""
-    config = settings.parse({"task": "cartpole", "model": "log_normal", **words})
+    config = settings.parse({"task": "cartpole", "model": "log_normal", **ALIKE, **words})
     for count in numbers(options, "counts", "10,100"):
         study(config, count, None, partial(report, f"{count} seeds"))
 
 
 def of_devices(options: dict[str, str], words: dict[str, str], report: Report) -> None:
     """A few trials of many seeds, on more and more devices."""
-    config = settings.parse({"task": "cartpole", "model": "log_normal", "trials": "3", **words})
+    config = settings.parse({"task": "cartpole", "model": "log_normal", **ALIKE, "trials": "3", **words})
     (seeds,) = numbers(options, "seeds", "100")
     first = None
     for count in sorted(numbers(options, "devices", "1,2,4")):
@@ -134,7 +134,7 @@ def of_devices(options: dict[str, str], words: dict[str, str], report: Report) -
 
 def of_particles(options: dict[str, str], words: dict[str, str], report: Report) -> None:
     """Search steps of very many particles, on more and more devices."""
-    words = {"task": "cartpole", "model": "log_normal", "search.particles": "100000", **words}
+    words = {"task": "cartpole", "model": "log_normal", **ALIKE, "search.particles": "100000", **words}
     config = settings.parse(words)
     small = workload({**words, "search.particles": "100"})  # nothing in a state depends on K
     states = jax.tree.map(lambda leaf: leaf[None], small.state)

@@ -21,15 +21,24 @@ from pegasus_jax.scenarios import draw
 from pegasus_jax.search import objective
 from pegasus_jax.types import Array, Experiment, Params, Period, RunState, Scenarios, Task, Trajectory
 
+# Every iteration alike, as the paper's and the peers' are: what a search refines by is another program.
+ALIKE = {"search.balanced": "false", "search.refine": "0"}
 SIZES = {
-    "cart-pole": {"task": "cartpole", "model": "log_normal", "policy": "dropout_mlp", "search.particles": "100"},
+    "cart-pole": {
+        "task": "cartpole",
+        "model": "log_normal",
+        "policy": "dropout_mlp",
+        "search.particles": "100",
+        **ALIKE,
+    },
     "double cart-pole": {"task": "double_cartpole", "model": "log_normal", "search.particles": "100"},
-    "swimmer, 6 legs": {"task": "swimmer_depth_change", "legs": "6", "search.particles": "100"},
+    "swimmer, 6 legs": {"task": "swimmer_depth_change", "legs": "6", "search.particles": "100", **ALIKE},
     "cart-pole, K=1000": {
         "task": "cartpole",
         "model": "log_normal",
         "policy": "dropout_mlp",
         "search.particles": "1000",
+        **ALIKE,
     },
 }
 EPISODES = 4  # of data

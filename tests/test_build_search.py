@@ -6,6 +6,7 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from jax.flatten_util import ravel_pytree
 
@@ -104,6 +105,27 @@ def test_a_search_that_found_a_better_policy_refines_that():
     assert alone(after)[1].objective[0] < info.objective[2] < alone(state)[1].objective[0]
 
 
+def test_after_a_stale_search_the_next_begins_from_a_fresh_policy_and_keeps_the_old():
+    """Nothing moves at this step size, so that the first search goes back to the policy it was given: a better one."""
+    still = dict(gain=0.3, refine=0.5, learning_rate=1e-30, cost="matched", **HELD)
+    (_, fresh, run), (_, _, obstinate) = searcher(**still), searcher(restart=False, **still)
+    good = -0.5 * jnp.array([[1.0, 1.6]])
+    stale, info = run(fresh._replace(policy=Learner(good, fresh.policy.optimizer)))
+    again, known = run(stale)
+    assert np.array_equal(stale.policy.params, good)
+    assert np.array_equal(again.policy.params, good)
+    assert known.objective[0] == obstinate(fresh)[1].objective[0] > info.objective[0]
+    assert obstinate(stale)[1].objective[0] == info.objective[0]
+
+
+def test_after_a_search_that_found_a_better_policy_the_next_begins_from_that():
+    better = dict(gain=-0.1, cost="matched", widen=1.0, learning_rate=0.02, refine=0.5, **HELD)
+    _, state, run = searcher(**better)
+    after, _ = run(state)
+    _, _, obstinate = searcher(restart=False, **better)
+    assert run(after)[1].objective[0] == obstinate(after)[1].objective[0] != run(state)[1].objective[0]
+
+
 def test_of_several_that_lost_their_way_the_best_that_was_given_goes_on():
     lost = dict(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
     _, state, run = searcher(scatter=0.3, starts=3, **lost)
@@ -134,7 +156,9 @@ def test_a_refining_search_in_parts_is_the_whole():
     part, parts = eagerly(partial(exp.search, steps=1)), state
     for first in range(4):
         parts, _ = part(parts, first)
-    np.testing.assert_allclose(parts.policy.params, run(state)[0].policy.params, rtol=1e-6)
+    whole = run(state)[0].policy
+    np.testing.assert_allclose(parts.policy.params, whole.params, rtol=1e-6)
+    assert all(optax.tree.get(learner.optimizer, "stale") for learner in (parts.policy, whole))
 
 
 def test_an_annealing_search_goes_on_where_that_of_the_trial_before_ended():

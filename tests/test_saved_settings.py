@@ -103,7 +103,7 @@ def test_a_run_from_before_a_setting_existed_goes_on_with_its_default(tmp_path):
     chosen = parse("search.steps=70", "seed=7")
     settings.save(chosen, tmp_path / "config.yaml")
     lines = (tmp_path / "config.yaml").read_text().splitlines()
-    older = [line for line in lines if "search.refine" not in line and "fit.decay" not in line]
+    older = [line for line in lines if "search.reheat" not in line and "fit.decay" not in line]
     assert len(older) == len(lines) - 2
     (tmp_path / "config.yaml").write_text("\n".join(older), encoding="utf-8")
     assert settings.load(tmp_path / "config.yaml") == chosen

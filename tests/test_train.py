@@ -260,6 +260,16 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(whole: Path) -> None:
     assert f"resume={whole}" in done.stderr
 
 
+def test_help_shows_the_settings_that_the_words_beside_it_leave(tmp_path: Path) -> None:
+    shown = {words: call("train", "--help", *words.split(), cwd=tmp_path) for words in ("", "task=gym policy=rbf")}
+    own, guest = (done.stdout for done in shown.values())
+    assert all(text in own for text in ("search.widen=2 ", "model.substeps=1 ", "with policy.kind=rbf"))
+    assert all(text in guest for text in ("search.widen=1 ", "policy.units=30 ", "with policy.kind=mlp"))
+    wrong = call("train", "--help", "task=gim", cwd=tmp_path)
+    assert (wrong.returncode, wrong.stdout) == (2, "")
+    assert "did you mean 'gym'" in wrong.stderr
+
+
 @pytest.mark.parametrize(
     ("name", "words"), [("train", "search.period.dynamics"), ("evaluate", "episodes"), ("plot", "RUN")]
 )

@@ -29,7 +29,8 @@ pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that 
   distributed=true      started on several hosts at once by SLURM or MPI: their devices act as one machine; without
                         those, coordinator=HOST:PORT processes=N process=I on each. They share OUT on one file system
 
-A named variant brings its defaults; the settings below change them one by one.
+A task and a named variant bring their own values of the settings below, which change them one by one. Shown is what
+they are with the words beside --help: pegasus-train task=gym algorithm=paper --help
 {settings}
 {others}
 examples
@@ -325,7 +326,11 @@ def whole(name: str, text: str) -> int:
     return int(text)
 
 
-def _help(text: str) -> str:
+HELP = {"-h", "--help", "help"}
+
+
+def _help(text: str, words: Sequence[str]) -> str:
+    """A command's help; of its settings as these words leave them. Raises SettingError for words that cannot be."""
     if "{settings}" not in text:
         return text
     from pegasus_jax import settings
@@ -334,14 +339,17 @@ def _help(text: str) -> str:
 
     named = dict(tasks=NAMES, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
     lists = {name: ", ".join(values) for name, values in named.items()}
+    _, dotted = settings.split([word for word in words if word not in HELP], OPTIONS)
+    config = settings.parse(dotted, OPTIONS)
     others = [
         f"\nwith {section}.kind={kind}, chosen by model=, policy= or algorithm=\n"
         + "\n".join(settings.help_lines(default, f"{section}."))
         + "\n"
         for section, kinds in KINDS.items()
-        for kind, default in list(kinds.items())[1:]
+        for kind, default in kinds.items()
+        if kind != getattr(config, section).kind
     ]
-    return text.format(settings="\n".join(settings.help_lines(Config())), others="".join(others), **lists)
+    return text.format(settings="\n".join(settings.help_lines(config)), others="".join(others), **lists)
 
 
 def main(
@@ -351,13 +359,13 @@ def main(
 ) -> None:
     """Run a command: 0 done, 1 stopped by its user, 2 a setting or a run's folder that cannot be, in one line."""
     words = sys.argv[1:]
-    if not words or {"-h", "--help", "help"} & {*words}:
-        print(_help(text), end="")
-        sys.exit(0 if words else 2)
-    _remember_compilations()
     from pegasus_jax.record import RunError
 
     try:
+        if not words or HELP & {*words}:
+            print(_help(text, words), end="")
+            sys.exit(0 if words else 2)
+        _remember_compilations()
         command(words)
     except (SettingError, RunError) as error:
         print(f"pegasus: {error}", file=sys.stderr)

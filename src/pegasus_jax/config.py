@@ -244,7 +244,9 @@ class Search:
     loosen: float = setting(1.0, "factor of the limit in the searches that are reheated")
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
-    restart: bool = setting(True, "start a search from a fresh policy when it imagines a lower cost than the old one")
+    restart: bool = setting(
+        True, "start a search from a fresh policy where that costs less than the old one, or the last search was stale"
+    )
     starts: int = setting(1, "policies searched side by side, the best of which goes on: the old one and fresh ones")
     sensors: str = setting("predicted", "noise on what the policy sees: as the model predicts, or the plant's: known")
     policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")

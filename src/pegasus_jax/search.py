@@ -78,10 +78,11 @@ def objective(
 
 
 class Started(NamedTuple):
-    """State of an optimiser that remembers where it started."""
+    """State of an optimiser that remembers where it started, and whether that led anywhere."""
 
     inner_state: optax.OptState
     start: Params
+    stale: Array  # [] whether the search went back to where it had started when it first turned
 
 
 def started(optimizer: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
@@ -90,9 +91,12 @@ def started(optimizer: optax.GradientTransformation) -> optax.GradientTransforma
 
     def update(updates: Params, state: Any, params: Params = None, **extra: Any) -> tuple[Params, Any]:
         updates, inner = optimizer.update(updates, state.inner_state, params, **extra)
-        return updates, Started(inner, state.start)
+        return updates, state._replace(inner_state=inner)
 
-    return optax.GradientTransformationExtraArgs(lambda params: Started(optimizer.init(params), params), update)  # type: ignore[arg-type]
+    def init(params: Params) -> Started:
+        return Started(optimizer.init(params), params, jnp.zeros((), bool))
+
+    return optax.GradientTransformationExtraArgs(init, update)  # type: ignore[arg-type]
 
 
 def optimise(
@@ -144,7 +148,8 @@ def optimise(
         both = jax.tree.map(lambda *leaves: jnp.stack(leaves), old, learner.params)
         of_old, of_new = jax.lax.map(lambda params: objective(params, belief, scenarios, *course.at(i)), both)
         kept = jax.tree.map(partial(jnp.where, of_new < of_old), learner.params, old)
-        optimizer = optax.tree.set(learner.optimizer, start=kept)
+        stale = jnp.where(i == course.turns[0], ~(of_new < of_old), optax.tree.get(learner.optimizer, "stale"))
+        optimizer = optax.tree.set(learner.optimizer, start=kept, stale=stale)
         return Learner(kept, optimizer), jnp.where(of_new < of_old, of_new, of_old)
 
     drawn = draw(key, first, belief)

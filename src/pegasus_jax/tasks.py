@@ -58,8 +58,17 @@ GYM = "gym"  # the task that `env=` and `cost=` describe
 MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe
 NAMES = (*TASKS, GYM, MJCF)
 
+# The search that finds a way on most seeds: docs/decisions/0014 and 0015.
+_FINDING: dict[str, Any] = {"search.balanced": True, "search.refine": 0.5}
+
 # A cost of one's own has neither an expectation nor a width; and so the swimmer was measured.
-_PLAIN_COST: dict[str, Any] = {"search.cost": "particles", "search.widen": 1.0}
+_PLAIN_COST: dict[str, Any] = {"search.cost": "particles", "search.widen": 1.0, **_FINDING}
+
+_CARTPOLE: dict[str, Any] = {
+    "model.substeps": 1,  # no pole turns fast enough for two to matter
+    "search.widen": 2.0,
+    **_FINDING,
+}
 
 # docs/reference.md 2.2; the paper's networks, dropout and step size.
 _DOUBLE_CARTPOLE: dict[str, Any] = {
@@ -92,9 +101,9 @@ _LEGS: dict[int, dict[str, Any]] = {
 
 
 # The model with which a task is learned best, where it is not the default one, and what is changed with it:
-# docs/decisions/0006, 0008, 0009 and 0014.
+# docs/decisions/0006, 0008 and 0009.
 BEST: dict[str, tuple[str, dict[str, Any]]] = {
-    "cartpole": ("lagrangian", {"search.balanced": True, "search.widen": 2.0, "search.refine": 0.5}),
+    "cartpole": ("lagrangian", {}),
     "double_cartpole": (
         "lagrangian",
         {
@@ -125,7 +134,7 @@ def defaults(name: str, legs: int = 2) -> dict[str, Any]:
     if name in (GYM, MJCF):
         return _PLAIN_COST
     if name == "cartpole":
-        return {"model.substeps": 1}  # no pole turns fast enough for two to matter
+        return _CARTPOLE
     if name == "double_cartpole":
         return _DOUBLE_CARTPOLE
     faster = {"search.learning_rate": 1e-3} if (name, legs) == ("swimmer_depth_change", 2) else {}

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from pegasus_jax import dataset, episode
 from pegasus_jax.calibration import calibration
@@ -118,22 +119,23 @@ def experiment(
             """The learner of iteration 0, when the model is new."""
             params = learner.params
             if search_restart:
-                params = restarted(params, policy.init(trial_key(state.key, state.trial, RESTART)), value)
+                stale = optax.tree.get(learner.optimizer, "stale", False)
+                params = restarted(params, policy.init(trial_key(state.key, state.trial, RESTART)), value, stale)
             return Learner(params, search.init(params)) if search_reset else learner._replace(params=params)
 
         earlier = search_steps * jnp.maximum(state.trial - max(1, explore_trials), 0) if search_goes_on else 0
         learner, info = search.run(key, state.policy, belief, first=first, earlier=earlier, steps=steps, begin=begin)
         return state._replace(policy=learner), info
 
-    def restarted(params: Params, fresh: Params, value: Callable[[Params], Array]) -> Params:
-        """`params`, or `fresh` when the new model expects no more of `params`.
+    def restarted(params: Params, fresh: Params, value: Callable[[Params], Array], stale: Array | bool) -> Params:
+        """`params`, or `fresh` when the new model expects no more of `params`, or the last search from them was stale.
 
         A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, so a policy
         that knows nothing is the better start. A tie goes to the fresh one; a model that imagines NaN changes nothing.
         """
         candidates = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, fresh)
         kept, new = jax.vmap(value)(candidates)
-        return jax.tree.map(partial(jnp.where, new <= kept), fresh, params)
+        return jax.tree.map(partial(jnp.where, (new <= kept) | stale), fresh, params)
 
     def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
         """Fit and search (Alg. 1 lines 5 and 6), unless the next episode is random too: then nothing, and NaN of it."""
