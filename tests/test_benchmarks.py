@@ -153,12 +153,12 @@ def test_searches_from_fresh_policies_are_judged_side_by_side(tmp_path, capsys, 
         return real(config, states, fresh) if len(seen) == 1 else np.full((4, fresh), [0.3, 0.5, 0.9])
 
     monkeypatch.setattr(searches, "searched", watched)
-    small = TINY | {"fit.steps": "5", "search.steps": "2"}
-    options = ["seeds=0-1", "after=1,2", "fresh=3", "each=search.widen=2", f"out={tmp_path}"]
+    small = TINY | {"fit.steps": "5", "search.steps": "2", "search.refine": "0"}
+    options = ["seeds=0-1", "after=1,2", "fresh=3", "each=search.widen=4", f"out={tmp_path}"]
     unchecked(searches.main)([*options, *(f"{name}={value}" for name, value in small.items())])
-    assert seen == [(4.0, False, [1, 1, 2, 2]), (2.0, False, [1, 1, 2, 2])]
+    assert seen == [(2.0, False, [1, 1, 2, 2]), (4.0, False, [1, 1, 2, 2])]
     costs = json.loads((tmp_path / "searches.json").read_text())["imagined"]
     assert np.shape(costs["as it is"]) == (4, 3)
     assert 0.9 < np.min(costs["as it is"]) <= 1, "two iterations swing nothing up"
-    assert costs["search.widen=2"] == [[0.3, 0.5, 0.9]] * 4
+    assert costs["search.widen=4"] == [[0.3, 0.5, 0.9]] * 4
     assert "mean 0.567  median 0.500  below .35 33%, .6 67%  above .8 33%" in capsys.readouterr().out

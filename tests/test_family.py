@@ -31,7 +31,9 @@ SMALL = {
     "fit.starts": "2",
     "search.steps": "2",
     "search.particles": "6",
-    "search.restart": "false",  # test_trial.py has it; here it would be half of each program to compile
+    # test_trial.py and test_build_search.py have these; here they would be half of each program to compile.
+    "search.restart": "false",
+    "search.refine": "0",
     "trials": "3",
 }
 PIECES = [policy for policy in POLICIES if policy != "rbf100"]  # which is rbf with more units

@@ -26,7 +26,7 @@ title = "Two clips"
 seeds = "3-4"
 trials = 2
 common = "model=deterministic policy=linear model.hidden=[4] fit.steps=2 search.steps=2 search.particles=5 \
-search.match=false search.cost=particles search.widen=1 search.restart=false"
+search.match=false search.cost=particles search.widen=1 search.restart=false search.refine=0"
 [variants]
 loose = "search.clip=1"
 tight = "search.clip=1e-3"

@@ -26,7 +26,7 @@ SHAPES = [
 ]
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=1"]
-TINY += ["explore.trials=0"]  # the episode is the untrained policy's
+TINY += ["explore.trials=0", "search.refine=0"]  # the episode is the untrained policy's; half as much to compile
 
 
 def parse(*words: str) -> Config:

@@ -182,9 +182,10 @@ def unpacked(packed: Params, like: Params) -> Params:
 def at_first(first: Array | int, begin: Begin, learner: Learner, value: Callable[[Params], Array]) -> Learner:
     """What a search that goes on from iteration `first` starts from: of iteration 0, what `begin` makes of the learner.
 
-    `value` is the objective of iteration 0.
+    `value` is the objective of iteration 0. `begin` also hears whether the search before was stale.
     """
-    return jax.lax.cond(jnp.asarray(first) == 0, lambda old: begin(old, value), lambda old: old, learner)
+    stale = optax.tree.get(learner.optimizer, "stale", jnp.zeros((), bool))
+    return jax.lax.cond(jnp.asarray(first) == 0, lambda old: begin(old, value, stale), lambda old: old, learner)
 
 
 def particles(

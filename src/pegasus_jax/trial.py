@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import optax
 
 from pegasus_jax import dataset, episode
 from pegasus_jax.calibration import calibration
@@ -115,11 +114,10 @@ def experiment(
         key = trial_key(state.key, state.trial, SEARCH)
         belief = dynamics.condition(state.model.params, state.data)
 
-        def begin(learner: Learner, value: Callable[[Params], Array]) -> Learner:
+        def begin(learner: Learner, value: Callable[[Params], Array], stale: Array) -> Learner:
             """The learner of iteration 0, when the model is new."""
             params = learner.params
             if search_restart:
-                stale = optax.tree.get(learner.optimizer, "stale", False)
                 params = restarted(params, policy.init(trial_key(state.key, state.trial, RESTART)), value, stale)
             return Learner(params, search.init(params)) if search_reset else learner._replace(params=params)
 
@@ -127,7 +125,7 @@ def experiment(
         learner, info = search.run(key, state.policy, belief, first=first, earlier=earlier, steps=steps, begin=begin)
         return state._replace(policy=learner), info
 
-    def restarted(params: Params, fresh: Params, value: Callable[[Params], Array], stale: Array | bool) -> Params:
+    def restarted(params: Params, fresh: Params, value: Callable[[Params], Array], stale: Array) -> Params:
         """`params`, or `fresh` when the new model expects no more of `params`, or the last search from them was stale.
 
         A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, so a policy

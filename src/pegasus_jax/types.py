@@ -156,8 +156,9 @@ class Fitter(NamedTuple):
     run: Callable[..., tuple[Learner, Any]]  # (key, learner, data, steps) -> (learner, FitInfo)
 
 
-# (learner, parameters -> the cost that iteration 0 sees) -> the learner that iteration 0 starts from
-Begin = Callable[[Learner, Callable[[Params], Array]], Learner]
+# (learner, parameters -> the cost that iteration 0 sees, whether the search before led nowhere [])
+# -> the learner that iteration 0 starts from
+Begin = Callable[[Learner, Callable[[Params], Array], Array], Learner]
 
 
 class Searcher(NamedTuple):
