@@ -1,6 +1,7 @@
 """What a config says of a search reaches the search: its objective, its gradient, its course."""
 
 import dataclasses
+import sys
 from functools import partial
 
 import jax
@@ -159,6 +160,21 @@ def test_a_refining_search_in_parts_is_the_whole():
     whole = run(state)[0].policy
     np.testing.assert_allclose(parts.policy.params, whole.params, rtol=1e-6)
     assert all(optax.tree.get(learner.optimizer, "stale") for learner in (parts.policy, whole))
+
+
+def test_what_is_weighed_needs_no_second_program(monkeypatch):
+    """The objective is traced as often with a restart and turns as without: to compile it again would take as long."""
+    traced = []
+    counted = lambda *given, **pieces: traced.append(1) or objective(*given, **pieces)  # noqa: E731
+    monkeypatch.setattr(sys.modules["pegasus_jax.build"], "objective", counted)
+
+    def times(**search):
+        traced.clear()
+        exp, state, _ = searcher(steps=4, **search)
+        jax.eval_shape(exp.search, state)
+        return len(traced)
+
+    assert times(refine=0.5) == times(refine=0.5, restart=False) == times(restart=False) > 0
 
 
 def test_an_annealing_search_goes_on_where_that_of_the_trial_before_ended():

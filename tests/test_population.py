@@ -29,7 +29,7 @@ def descent():
     """Plain gradient descent, as a searcher without scenarios."""
     optimizer = optax.sgd(0.02, momentum=0.5)
 
-    def run(key, learner, belief, *, first, steps, earlier=0, begin=None):
+    def run(key, learner, belief, *, first, steps, earlier=0):
         def step(learner, _):
             value, gradient = jax.value_and_grad(wells)(learner.params, belief)
             updates, state = optimizer.update(gradient, learner.optimizer)

@@ -16,8 +16,8 @@ from pegasus_jax import cost as costs
 from pegasus_jax import lbfgs
 from pegasus_jax.gaussian import Image, chain, joint, residual, sincos
 from pegasus_jax.rollout import NoiseUse
-from pegasus_jax.search import SearchInfo, at_first
-from pegasus_jax.types import Array, Begin, Dynamics, Key, Learner, Params, Policy, Searcher
+from pegasus_jax.search import SearchInfo
+from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Policy, Searcher
 
 
 class Gaussians(NamedTuple):
@@ -121,7 +121,7 @@ def analytic(
         *,
         first: Array | int,
         steps: int,
-        begin: Begin | None = None,
+        rival: Params | None = None,
         **_: Any,
     ) -> tuple[Learner, SearchInfo]:
         std = noise_std(key, belief)
@@ -129,8 +129,15 @@ def analytic(
         def value(params: Params) -> Array:
             return objective(params, belief, std)
 
-        if begin is not None:
-            learner = at_first(first, begin, learner, value)
+        def cheaper(params: Params) -> Params:
+            """These, or the rival's where that costs no more."""
+            both = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, rival)
+            own, other = jax.vmap(value)(both)
+            return jax.tree.map(partial(jnp.where, other <= own), rival, params)
+
+        new = jnp.asarray(first) == 0
+        if rival is not None:
+            learner = learner._replace(params=jax.lax.cond(new, cheaper, lambda params: params, learner.params))
 
         def idle(d: lbfgs.Descent) -> tuple[lbfgs.Descent, tuple[Array, Params]]:
             return d, (d.value, optax.tree.get(d.state, "grad"))
@@ -139,7 +146,6 @@ def analytic(
             d, (cost, gradient) = jax.lax.cond(d.failures < 2, partial(lbfgs.step, value), idle, d)
             return d, (cost, optax.tree.norm(gradient))
 
-        new = jnp.asarray(first) == 0
         descent = jax.tree.map(partial(jnp.where, new), lbfgs.begin(learner.params), learner.optimizer)
         after, (values, norms) = jax.lax.scan(iterate, descent, None, steps)
         return Learner(after.params, after), SearchInfo(values, norms, after.skipped - descent.skipped)

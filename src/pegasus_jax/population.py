@@ -18,7 +18,7 @@ def best_of(
 
     The first is the policy it is given, the others are `fresh` at iteration 0 of each trial; or of the first search
     where they are `lasting`, and then each goes on from trial to trial, whichever is the best. All begin a trial with a
-    new optimiser, so `begin` is not asked. The learner's parameters are always those of the member with the lowest
+    new optimiser, and none has a rival. The learner's parameters are always those of the member with the lowest
     mean objective over the last `window` iterations, or as many as there were. Its optimiser is all members: a
     `Learner` [starts, ...].
     """
@@ -28,9 +28,17 @@ def best_of(
         return Learner(members, jax.vmap(searcher.init)(members))
 
     def run(
-        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, begin: Any = None, **more: Any
+        key: Key,
+        learner: Learner,
+        belief: Params,
+        *,
+        first: Array | int,
+        steps: int,
+        rival: Any = None,
+        reset: bool = True,
+        **more: Any,
     ) -> tuple[Learner, Any]:
-        del begin
+        del rival, reset
 
         def gathered() -> Params:
             others = jax.vmap(fresh)(jax.random.split(jax.random.fold_in(key, FRESH), starts - 1))

@@ -13,7 +13,7 @@ from pegasus_jax.course import Course
 from pegasus_jax.fit import guarded, skipped
 from pegasus_jax.rollout import NoiseUse, rollout
 from pegasus_jax.scenarios import Blocks, draw, redraw
-from pegasus_jax.types import Array, Begin, Dynamics, Key, Learner, Params, Period, Policy, Scenarios, Searcher
+from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Period, Policy, Scenarios, Searcher
 
 
 class Remembering(NamedTuple):
@@ -99,6 +99,21 @@ def started(optimizer: optax.GradientTransformation) -> optax.GradientTransforma
     return optax.GradientTransformationExtraArgs(init, update)  # type: ignore[arg-type]
 
 
+class Walk(NamedTuple):
+    """Where a search is. Where it weighs, an iteration is three visits: of the rival, of its own parameters, a step."""
+
+    learner: Learner
+    scenarios: Scenarios  # packed
+    iteration: Array  # [] int32
+    visit: Array  # [] RIVAL, OWN or STEP
+    held: Array  # [] what the rival costs
+    values: Array  # [steps]
+    norms: Array  # [steps]
+
+
+RIVAL, OWN, STEP = range(3)
+
+
 def optimise(
     key: Key,
     learner: Learner,
@@ -112,57 +127,99 @@ def optimise(
     first: Array | int = 0,
     earlier: Array | int = 0,
     course: Course = Course(),
-    begin: Begin | None = None,
+    rival: Params | None = None,
+    reset: bool = False,
 ) -> tuple[Learner, SearchInfo]:
     """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 19).
 
     One call of n steps and two calls of n/2, the second with first=n/2, do the same. With a stage in the `course`, the
     objective takes one more argument, the stage of the iteration; a course with turns needs a `started` optimiser.
     The course counts from `earlier`: the iterations of the searches before this one, where it goes on with theirs.
-    """
-    first = jnp.asarray(first, jnp.int32)
-    optimizer = optax.with_extra_args_support(optimizer)
 
-    def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], tuple[Array, Array]]:
-        learner, scenarios = carry[0], unpacked(carry[1], like=drawn)
-        value, gradient = jax.value_and_grad(objective)(learner.params, belief, scenarios, *course.at(earlier + i))
+    Iteration 0 goes on from the `rival`, if there is one, where that costs no more than the learner's parameters, or
+    where the search before was stale; with `reset`, with a new optimiser. At a turn, the end among them, a search goes
+    on from what it started from, or had at the turn before, unless what it has now costs less. NaN decides for the
+    older ones. What is weighed visits the loop's own objective: another one would take as long again to compile.
+    """
+    optimizer = optax.with_extra_args_support(optimizer)
+    weighs = bool(course.turns) or rival is not None
+    stale = optax.tree.get(learner.optimizer, "stale", False)
+    if reset:
+        anew = lambda old: old._replace(optimizer=optimizer.init(old.params))  # noqa: E731
+        learner = jax.lax.cond(first == 0, anew, lambda old: old, learner)
+    if course.turns:
+        start = _where(first == 0, learner.params, optax.tree.get(learner.optimizer, "start"))
+        learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, start=start))
+
+    def turns(i: Array) -> Array:
+        return jnp.any(i == jnp.asarray(course.turns, jnp.int32))
+
+    def other(learner: Learner, i: Array) -> Params:
+        """What the learner's parameters are weighed against."""
+        if not course.turns:
+            return rival
+        start = optax.tree.get(learner.optimizer, "start")
+        return start if rival is None else _where(i == 0, rival, start)
+
+    def visit(_: Array, walk: Walk) -> Walk:
+        learner, i = walk.learner, walk.iteration
+        scenarios = unpacked(walk.scenarios, like=drawn)
+        params = _where(walk.visit == RIVAL, other(learner, i), learner.params) if weighs else learner.params
+        value, gradient = jax.value_and_grad(objective)(params, belief, scenarios, *course.at(earlier + i))
+        steps_now, after = walk.visit == STEP, stepped(learner, i, value, gradient)
+        if weighs:
+            after = _where(steps_now, after, _where(walk.visit == OWN, chosen(walk, value), learner))
+        # Of an iteration after which it turned, the cost of what it goes on from.
+        settles = (walk.visit == OWN) & (i > 0)
+        row = jnp.where(steps_now, i - first, jnp.where(settles, i - first - 1, steps))
+        cost = jnp.where(settles & ~(value < walk.held), walk.held, value)
+        reached = i + steps_now
+        return Walk(
+            after,
+            packed(redraw(key, reached, scenarios, belief)),
+            reached,
+            jnp.where(steps_now, jnp.where(turns(reached), RIVAL, STEP), walk.visit + 1),
+            value,
+            walk.values.at[row].set(cost, mode="drop"),
+            walk.norms.at[jnp.where(steps_now, row, steps)].set(optax.tree.norm(gradient), mode="drop"),
+        )
+
+    def stepped(learner: Learner, i: Array, value: Array, gradient: Params) -> Learner:
         # A wider cost is a lower one: its value says nothing about which parameters are best.
         known = jnp.where(i < course.settled, jnp.inf, value) if course.settled else value
         updates, state = optimizer.update(gradient, learner.optimizer, learner.params, value=known)
         if course.pace is not None:
             updates = optax.tree.scale(course.pace(earlier + i), updates)
-        learner = Learner(optax.apply_updates(learner.params, updates), state)
-        scenarios = redraw(key, i + 1, scenarios, belief)
-        if course.turns:
-            turns = jnp.any(i + 1 == jnp.asarray(course.turns))
-            onwards = lambda learner, value, *_: (learner, value)  # noqa: E731
-            learner, value = jax.lax.cond(turns, better, onwards, learner, value, scenarios, i + 1)
-        return (learner, packed(scenarios)), (value, optax.tree.norm(gradient))
+        return Learner(optax.apply_updates(learner.params, updates), state)
 
-    def better(learner: Learner, _: Array, scenarios: Scenarios, i: Array) -> tuple[Learner, Array]:
-        """The learner at its parameters, or at those it was given or had at the turn before, and what it costs.
+    def chosen(walk: Walk, value: Array) -> Learner:
+        """The learner at its own parameters, which cost `value`, or at the rival's."""
+        learner, i = walk.learner, walk.iteration
+        begins = i == 0
+        yields = jnp.where(begins, (walk.held <= value) | stale, ~(value < walk.held))
+        kept = Learner(_where(yields, other(learner, i), learner.params), learner.optimizer)
+        if not course.turns:
+            return kept
+        was = optax.tree.get(learner.optimizer, "stale")
+        now = dict(
+            start=_where(begins, optax.tree.get(learner.optimizer, "start"), kept.params),
+            stale=jnp.where(~begins & (i == course.turns[0]), yields, was),
+        )
+        return kept._replace(optimizer=optax.tree.set(learner.optimizer, **now))
 
-        A tie, or NaN, goes to the older ones.
-        """
-        old = optax.tree.get(learner.optimizer, "start")
-        both = jax.tree.map(lambda *leaves: jnp.stack(leaves), old, learner.params)
-        of_old, of_new = jax.lax.map(lambda params: objective(params, belief, scenarios, *course.at(i)), both)
-        kept = jax.tree.map(partial(jnp.where, of_new < of_old), learner.params, old)
-        stale = jnp.where(i == course.turns[0], ~(of_new < of_old), optax.tree.get(learner.optimizer, "stale"))
-        optimizer = optax.tree.set(learner.optimizer, start=kept, stale=stale)
-        return Learner(kept, optimizer), jnp.where(of_new < of_old, of_new, of_old)
-
-    drawn = draw(key, first, belief)
-    given = learner.params
-    if begin is not None:
-        stage = course.at(earlier)
-        learner = at_first(first, begin, learner, lambda params: objective(params, belief, drawn, *stage))
-    if course.turns:
-        kept = jax.tree.map(partial(jnp.where, first == 0), given, optax.tree.get(learner.optimizer, "start"))
-        learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, start=kept))
+    drawn, begun = draw(key, jnp.asarray(first, jnp.int32), belief), jnp.asarray(first, jnp.int32)
     before = skipped(learner.optimizer)
-    (learner, _), (values, norms) = jax.lax.scan(step, (learner, packed(drawn)), first + jnp.arange(steps))
+    begins = rival is not None and first == 0
+    weighings = begins + sum((first < turn) & (turn <= first + steps) for turn in course.turns)
+    none = jnp.full(steps, jnp.nan)
+    walk = Walk(learner, packed(drawn), begun, jnp.where(begins, RIVAL, STEP), none[0], none, none)
+    learner, *_, values, norms = jax.lax.fori_loop(0, steps + 2 * weighings, visit, walk)
     return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
+
+
+def _where(condition: Array | bool, yes: Params, no: Params) -> Params:
+    """One of two pytrees of the same structure."""
+    return jax.tree.map(partial(jnp.where, condition), yes, no)
 
 
 def packed(scenarios: Params) -> Params:
@@ -177,15 +234,6 @@ def packed(scenarios: Params) -> Params:
 def unpacked(packed: Params, like: Params) -> Params:
     """The scenarios that were packed, in the shapes of `like`."""
     return jax.tree.map(lambda leaf, shaped: leaf.reshape(shaped.shape), packed, like)
-
-
-def at_first(first: Array | int, begin: Begin, learner: Learner, value: Callable[[Params], Array]) -> Learner:
-    """What a search that goes on from iteration `first` starts from: of iteration 0, what `begin` makes of the learner.
-
-    `value` is the objective of iteration 0. `begin` also hears whether the search before was stale.
-    """
-    stale = optax.tree.get(learner.optimizer, "stale", jnp.zeros((), bool))
-    return jax.lax.cond(jnp.asarray(first) == 0, lambda old: begin(old, value, stale), lambda old: old, learner)
 
 
 def particles(

@@ -1,7 +1,6 @@
 """The loop of Alg. 1 as three seams: collect (the plant), absorb (the data), improve (the mind)."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -114,26 +113,13 @@ def experiment(
         key = trial_key(state.key, state.trial, SEARCH)
         belief = dynamics.condition(state.model.params, state.data)
 
-        def begin(learner: Learner, value: Callable[[Params], Array], stale: Array) -> Learner:
-            """The learner of iteration 0, when the model is new."""
-            params = learner.params
-            if search_restart:
-                params = restarted(params, policy.init(trial_key(state.key, state.trial, RESTART)), value, stale)
-            return Learner(params, search.init(params)) if search_reset else learner._replace(params=params)
-
         earlier = search_steps * jnp.maximum(state.trial - max(1, explore_trials), 0) if search_goes_on else 0
-        learner, info = search.run(key, state.policy, belief, first=first, earlier=earlier, steps=steps, begin=begin)
+        # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
+        # that knows nothing is the better start.
+        fresh = policy.init(trial_key(state.key, state.trial, RESTART)) if search_restart else None
+        begin = dict(first=first, earlier=earlier, rival=fresh, reset=search_reset)
+        learner, info = search.run(key, state.policy, belief, steps=steps, **begin)
         return state._replace(policy=learner), info
-
-    def restarted(params: Params, fresh: Params, value: Callable[[Params], Array], stale: Array) -> Params:
-        """`params`, or `fresh` when the new model expects no more of `params`, or the last search from them was stale.
-
-        A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, so a policy
-        that knows nothing is the better start. A tie goes to the fresh one; a model that imagines NaN changes nothing.
-        """
-        candidates = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, fresh)
-        kept, new = jax.vmap(value)(candidates)
-        return jax.tree.map(partial(jnp.where, (new <= kept) | stale), fresh, params)
 
     def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
         """Fit and search (Alg. 1 lines 5 and 6), unless the next episode is random too: then nothing, and NaN of it."""

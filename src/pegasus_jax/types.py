@@ -156,16 +156,11 @@ class Fitter(NamedTuple):
     run: Callable[..., tuple[Learner, Any]]  # (key, learner, data, steps) -> (learner, FitInfo)
 
 
-# (learner, parameters -> the cost that iteration 0 sees, whether the search before led nowhere [])
-# -> the learner that iteration 0 starts from
-Begin = Callable[[Learner, Callable[[Params], Array], Array], Learner]
-
-
 class Searcher(NamedTuple):
     """How a policy improves in imagination (Alg. 1 line 6)."""
 
     init: Callable[[Params], Any]  # parameters -> the optimiser's state
-    # (key, learner, belief, first=, earlier=, steps=, begin=) -> (learner, SearchInfo)
+    # (key, learner, belief, first=, earlier=, steps=, rival=, reset=) -> (learner, SearchInfo)
     run: Callable[..., tuple[Learner, Any]]
 
 
