@@ -87,6 +87,14 @@ HELD = dict(steps=4, period=Period(0, 0, 0, 0, 0))  # the same scenarios for eve
 ALONE = dict(match=False, restart=False, **HELD)
 
 
+def test_a_search_that_refines_for_no_iteration_weighs_once_at_its_end():
+    _, state, run = searcher(cost="matched", widen=2.0, refine=0.01, learning_rate=10.0, **HELD)
+    after, info = run(state)
+    assert np.array_equal(after.policy.params, state.policy.params)
+    assert np.all(np.isfinite(info.objective))
+    assert np.all(np.isfinite(info.gradient_norm))
+
+
 def test_a_search_that_lost_its_way_refines_and_ends_with_the_policy_it_was_given():
     """With steps of 10 neither half is of use. What refines has no matching, and each particle's own cost."""
     _, state, run = searcher(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)

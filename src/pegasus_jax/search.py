@@ -210,7 +210,7 @@ def optimise(
     drawn, begun = draw(key, jnp.asarray(first, jnp.int32), belief), jnp.asarray(first, jnp.int32)
     before = skipped(learner.optimizer)
     begins = rival is not None and first == 0
-    weighings = begins + sum((first < turn) & (turn <= first + steps) for turn in course.turns)
+    weighings = begins + sum((first < turn) & (turn <= first + steps) for turn in {*course.turns})
     none = jnp.full(steps, jnp.nan)
     walk = Walk(learner, packed(drawn), begun, jnp.where(begins, RIVAL, STEP), none[0], none, none)
     learner, *_, values, norms = jax.lax.fori_loop(0, steps + 2 * weighings, visit, walk)
