@@ -38,10 +38,9 @@ def eagerly(function):
 
 
 def searcher(gain=-0.5, scatter=0.0, **search):
-    """An experiment under a config, its first state, and a one-step search from it."""
-    chosen = dataclasses.replace(
-        tiny(), search=config.Search(**{"steps": 1, "particles": 5, "cost": "particles", "widen": 1.0, **search})
-    )
+    """An experiment under a config, its first state, and a one-step search from it, which weighs no fresh policy."""
+    plain = {"steps": 1, "particles": 5, "cost": "particles", "widen": 1.0, "restart": False}
+    chosen = dataclasses.replace(tiny(), search=config.Search(**{**plain, **search}))
     policy = linear_policy(2, 1)._replace(
         init=lambda key: gain * jnp.array([[1.0, 1.6]]) + scatter * jax.random.normal(key, (1, 2))
     )
@@ -84,7 +83,7 @@ def test_a_search_starts_with_the_wider_cost_and_ends_with_the_tasks(of):
 
 
 HELD = dict(steps=4, period=Period(0, 0, 0, 0, 0))  # the same scenarios for every iteration
-ALONE = dict(match=False, restart=False, **HELD)
+ALONE = dict(match=False, **HELD)
 
 
 def test_a_search_that_refines_for_no_iteration_weighs_once_at_its_end():
@@ -117,7 +116,7 @@ def test_a_search_that_found_a_better_policy_refines_that():
 def test_after_a_stale_search_the_next_begins_from_a_fresh_policy_and_keeps_the_old():
     """Nothing moves at this step size, so that the first search goes back to the policy it was given: a better one."""
     still = dict(gain=0.3, refine=0.5, learning_rate=1e-30, cost="matched", **HELD)
-    (_, fresh, run), (_, _, obstinate) = searcher(**still), searcher(restart=False, **still)
+    (_, fresh, run), (_, _, obstinate) = searcher(restart=True, **still), searcher(**still)
     good = -0.5 * jnp.array([[1.0, 1.6]])
     stale, info = run(fresh._replace(policy=Learner(good, fresh.policy.optimizer)))
     again, known = run(stale)
@@ -129,9 +128,9 @@ def test_after_a_stale_search_the_next_begins_from_a_fresh_policy_and_keeps_the_
 
 def test_after_a_search_that_found_a_better_policy_the_next_begins_from_that():
     better = dict(gain=-0.1, cost="matched", widen=1.0, learning_rate=0.02, refine=0.5, **HELD)
-    _, state, run = searcher(**better)
+    _, state, run = searcher(restart=True, **better)
     after, _ = run(state)
-    _, _, obstinate = searcher(restart=False, **better)
+    _, _, obstinate = searcher(**better)
     assert run(after)[1].objective[0] == obstinate(after)[1].objective[0] != run(state)[1].objective[0]
 
 
@@ -182,7 +181,7 @@ def test_what_is_weighed_needs_no_second_program(monkeypatch):
         jax.eval_shape(exp.search, state)
         return len(traced)
 
-    assert times(refine=0.5) == times(refine=0.5, restart=False) == times(restart=False) > 0
+    assert times(refine=0.5, restart=True) == times(refine=0.5) == times() > 0
 
 
 def test_an_annealing_search_goes_on_where_that_of_the_trial_before_ended():
