@@ -133,7 +133,7 @@ def analytic(
             """These, or the rival's where that costs no more."""
             both = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, rival)
             own, other = jax.vmap(value)(both)
-            return jax.tree.map(partial(jnp.where, other <= own), rival, params)
+            return optax.tree.where(other <= own, rival, params)
 
         new = jnp.asarray(first) == 0
         if rival is not None:
@@ -146,7 +146,7 @@ def analytic(
             d, (cost, gradient) = jax.lax.cond(d.failures < 2, partial(lbfgs.step, value), idle, d)
             return d, (cost, optax.tree.norm(gradient))
 
-        descent = jax.tree.map(partial(jnp.where, new), lbfgs.begin(learner.params), learner.optimizer)
+        descent = optax.tree.where(new, lbfgs.begin(learner.params), learner.optimizer)
         after, (values, norms) = jax.lax.scan(iterate, descent, None, steps)
         return Learner(after.params, after), SearchInfo(values, norms, after.skipped - descent.skipped)
 

@@ -34,7 +34,7 @@ def remembering(optimizer: optax.GradientTransformation) -> optax.GradientTransf
     def update(updates: Params, state: Any, params: Params = None, *, value: Array, **extra: Any) -> tuple[Params, Any]:
         updates, inner = optimizer.update(updates, state.inner_state, params, value=value, **extra)
         better = value < state.best_value
-        kept = jax.tree.map(partial(jnp.where, better), params, state.best_params)
+        kept = optax.tree.where(better, params, state.best_params)
         return updates, Remembering(inner, jnp.where(better, value, state.best_value), kept)
 
     return optax.GradientTransformationExtraArgs(init, update)  # type: ignore[arg-type]
@@ -148,7 +148,7 @@ def optimise(
         anew = lambda old: old._replace(optimizer=optimizer.init(old.params))  # noqa: E731
         learner = jax.lax.cond(first == 0, anew, lambda old: old, learner)
     if course.turns:
-        start = _where(first == 0, learner.params, optax.tree.get(learner.optimizer, "start"))
+        start = optax.tree.where(first == 0, learner.params, optax.tree.get(learner.optimizer, "start"))
         learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, start=start))
 
     def turns(i: Array) -> Array:
@@ -159,16 +159,18 @@ def optimise(
         if not course.turns:
             return rival
         start = optax.tree.get(learner.optimizer, "start")
-        return start if rival is None else _where(i == 0, rival, start)
+        return start if rival is None else optax.tree.where(i == 0, rival, start)
 
     def visit(_: Array, walk: Walk) -> Walk:
         learner, i = walk.learner, walk.iteration
         scenarios = unpacked(walk.scenarios, like=drawn)
-        params = _where(walk.visit == RIVAL, other(learner, i), learner.params) if weighs else learner.params
+        params = optax.tree.where(walk.visit == RIVAL, other(learner, i), learner.params) if weighs else learner.params
         value, gradient = jax.value_and_grad(objective)(params, belief, scenarios, *course.at(earlier + i))
         steps_now, after = walk.visit == STEP, stepped(learner, i, value, gradient)
         if weighs:
-            after = _where(steps_now, after, _where(walk.visit == OWN, chosen(walk, value), learner))
+            after = optax.tree.where(
+                steps_now, after, optax.tree.where(walk.visit == OWN, chosen(walk, value), learner)
+            )
         # Of an iteration after which it turned, the cost of what it goes on from.
         settles = (walk.visit == OWN) & (i > 0)
         row = jnp.where(steps_now, i - first, jnp.where(settles, i - first - 1, steps))
@@ -197,29 +199,24 @@ def optimise(
         learner, i = walk.learner, walk.iteration
         begins = i == 0
         yields = jnp.where(begins, (walk.held <= value) | stale, ~(value < walk.held))
-        kept = Learner(_where(yields, other(learner, i), learner.params), learner.optimizer)
+        kept = Learner(optax.tree.where(yields, other(learner, i), learner.params), learner.optimizer)
         if not course.turns:
             return kept
         was = optax.tree.get(learner.optimizer, "stale")
         now = dict(
-            start=_where(begins, optax.tree.get(learner.optimizer, "start"), kept.params),
+            start=optax.tree.where(begins, optax.tree.get(learner.optimizer, "start"), kept.params),
             stale=jnp.where(~begins & (i == course.turns[0]), yields, was),
         )
         return kept._replace(optimizer=optax.tree.set(learner.optimizer, **now))
 
-    drawn, begun = draw(key, jnp.asarray(first, jnp.int32), belief), jnp.asarray(first, jnp.int32)
-    before = skipped(learner.optimizer)
+    begun, before = jnp.asarray(first, jnp.int32), skipped(learner.optimizer)
+    drawn = draw(key, begun, belief)
     begins = rival is not None and first == 0
     weighings = begins + sum((first < turn) & (turn <= first + steps) for turn in {*course.turns})
     none = jnp.full(steps, jnp.nan)
     walk = Walk(learner, packed(drawn), begun, jnp.where(begins, RIVAL, STEP), none[0], none, none)
     learner, *_, values, norms = jax.lax.fori_loop(0, steps + 2 * weighings, visit, walk)
     return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
-
-
-def _where(condition: Array | bool, yes: Params, no: Params) -> Params:
-    """One of two pytrees of the same structure."""
-    return jax.tree.map(partial(jnp.where, condition), yes, no)
 
 
 def packed(scenarios: Params) -> Params:
@@ -271,7 +268,7 @@ def keeping_best(searcher: Searcher, last: int) -> Searcher:
         learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, best_value=known))
         learner, info = searcher.run(key, learner, belief, first=first, steps=steps, **more)
         best = optax.tree.get(learner.optimizer, "best_params")
-        kept = jax.tree.map(partial(jnp.where, first + steps >= last), best, learner.params)
+        kept = optax.tree.where(first + steps >= last, best, learner.params)
         return learner._replace(params=kept), info
 
     return searcher._replace(run=run)

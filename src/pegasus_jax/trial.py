@@ -117,8 +117,9 @@ def experiment(
         # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
         # that knows nothing is the better start.
         fresh = policy.init(trial_key(state.key, state.trial, RESTART)) if search_restart else None
-        begin = dict(first=first, earlier=earlier, rival=fresh, reset=search_reset)
-        learner, info = search.run(key, state.policy, belief, steps=steps, **begin)
+        learner, info = search.run(
+            key, state.policy, belief, first=first, earlier=earlier, steps=steps, rival=fresh, reset=search_reset
+        )
         return state._replace(policy=learner), info
 
     def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
