@@ -323,7 +323,7 @@ def test_clipping_limits_the_update_and_keeps_its_direction():
 
 
 def test_a_search_in_pieces_is_the_same_search_to_the_bit():
-    """What lets a progress display look in, and a killed run go on."""
+    """What lets a progress display look in, and a killed run go on. The compiler's emitters round both programs alike."""
     task = cart(horizon=4)
     dynamics, policy = regression(2, 1), noisy_linear_policy(task)
     blocks = scenarios.blocks(
@@ -340,7 +340,8 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
 
     def search(steps):
         draws = {name: partial(getattr(scenarios, name), **pieces) for name in ("draw", "redraw")}
-        return jax.jit(partial(optimise, **draws, objective=value, optimizer=optimizer, steps=steps))
+        function = partial(optimise, **draws, objective=value, optimizer=optimizer, steps=steps)
+        return jax.jit(function, compiler_options={"xla_cpu_use_fusion_emitters": True})
 
     key, belief = jax.random.key(3), jnp.full((3, 2), 0.2)
     params = jnp.full((1, 2), 0.3)

@@ -164,7 +164,7 @@ def alike(study: Path, other: Path) -> None:
 def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_path: Path) -> None:
     """Four devices made of this processor, two for the seeds and two for the particles; resumed on one device."""
     folder, words = tmp_path / "mesh", [*WORDS, "trials=1", "seeds=2", "mesh=2x2"]
-    done = call("train", *words, f"out={folder}", cwd=tmp_path, XLA_FLAGS="--xla_force_host_platform_device_count=4")
+    done = call("train", *words, f"out={folder}", cwd=tmp_path, JAX_NUM_CPU_DEVICES="4")
     assert done.returncode == 0, done.stderr
     assert call("train", f"resume={folder}", "trials=2", cwd=tmp_path).returncode == 0
     alike(study, folder)

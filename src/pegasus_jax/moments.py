@@ -81,7 +81,9 @@ def keep(x: Array, z: Array) -> Array:
 
 def standardise(z: Array) -> Array:
     """Draws z [..., K, D] with their sample mean made exactly 0 and sample covariance exactly I, over K."""
-    centred = z - jnp.mean(z, -2, keepdims=True)
-    cov = jnp.swapaxes(centred, -1, -2) @ centred / (z.shape[-2] - 1)
-    root = jnp.linalg.cholesky(cov)
-    return jnp.swapaxes(jnp.linalg.solve(root, jnp.swapaxes(centred, -1, -2)), -1, -2)
+
+    def one(z: Array) -> Array:
+        mean, cov = mean_and_cov(z)
+        return (z - mean) @ _factor(cov)[1].T
+
+    return jnp.vectorize(one, signature="(k,d)->(k,d)")(z)
