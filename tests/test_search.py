@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from pegasus_jax import cost, moments, scenarios
-from pegasus_jax.course import Course, narrowing, pace, reheated
+from pegasus_jax.course import Course, either, narrowing, pace, reheated
 from pegasus_jax.fit import guarded
 from pegasus_jax.rollout import NoiseUse
 from pegasus_jax.search import keeping_best, objective, optimise, remembering, started
@@ -354,6 +354,13 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     assert same(whole, learner)
     assert np.array_equal(info.objective, np.concatenate(values))
     assert len(np.unique(info.objective)) == 6
+
+
+@pytest.mark.parametrize(("asked", "slope"), [(True, 2.0), (False, np.inf)])
+def test_what_is_not_asked_for_reaches_no_gradient(asked, slope):
+    """Though it is computed, and would make NaN of a slope that is not asked for times an infinite one."""
+    double, explode = lambda x: 2.0 * x, jnp.exp
+    assert jax.jit(jax.grad(lambda x: either(jnp.asarray(asked), double, explode)(x)))(1e3) == slope
 
 
 # The best iterate

@@ -1,10 +1,8 @@
 """What changes over the iterations of a search: the width of its cost, its step size, whether it refines."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import optax
 
@@ -51,5 +49,16 @@ def reheated(annealed: Schedule, over: int, steps: int, top: float, decay: float
 
 
 def either(condition: Array | None, yes: Callable[..., Array], no: Callable[..., Array]) -> Callable[..., Array]:
-    """The function that is `yes` where the condition holds and else `no`; without a condition, `no`."""
-    return no if condition is None else partial(jax.lax.cond, condition, yes, no)
+    """The function that is `yes` where the condition holds and else `no`; without a condition, `no`.
+
+    Both are computed, because a branch at each time step costs a GPU more than they do. The one that is not asked for
+    gets zeros: what it would make of a particle that has diverged reaches no gradient.
+    """
+    if condition is None:
+        return no
+
+    def chosen(*arguments: Array) -> Array:
+        asked, other = ([jnp.where(c, a, 0) for a in arguments] for c in (condition, ~condition))
+        return jnp.where(condition, yes(*asked), no(*other))
+
+    return chosen
