@@ -323,7 +323,7 @@ def test_clipping_limits_the_update_and_keeps_its_direction():
 
 
 def test_a_search_in_pieces_is_the_same_search_to_the_bit():
-    """What lets a progress display look in, and a killed run go on. Emitters, as a run has, round both programs alike."""
+    """What lets a progress display look in, and a killed run go on. The emitters of a run round both programs alike."""
     task = cart(horizon=4)
     dynamics, policy = regression(2, 1), noisy_linear_policy(task)
     blocks = scenarios.blocks(
