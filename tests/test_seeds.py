@@ -23,7 +23,8 @@ from pegasus_jax.program import Program, over_seeds
 from probes import cart, tiny, unchecked
 from test_train import TINY, call, fingerprint, program
 
-WORDS = [*TINY, "trials=2", "seed=1"]
+# Fitted for longer: under a model that has hardly been, every policy costs 1, and Adam follows a gradient's rounding.
+WORDS = [*TINY, "trials=2", "seed=1", "fit.steps=400"]
 
 
 @pytest.fixture(scope="module")
@@ -56,7 +57,7 @@ def test_a_seed_among_others_leaves_what_it_leaves_alone(study: Path, tmp_path: 
     for a, b in zip(record.trials(alone), record.trials(among), strict=True):
         assert a.keys() == b.keys()
         for name in ("mean_cost", "objective_first", "objective_last", "objective_fresh"):
-            assert a[name] == pytest.approx(b[name], abs=2e-3), name
+            assert a[name] == pytest.approx(b[name], abs=2e-4), name
     assert fingerprint(study / "seed1") != fingerprint(among)
 
 
@@ -158,7 +159,7 @@ def alike(study: Path, other: Path) -> None:
     for seed in ("seed1", "seed2"):
         for a, b in zip(record.trials(study / seed), record.trials(other / seed), strict=True):
             for name in ("mean_cost", "objective_first", "objective_last", "objective_fresh"):
-                assert a[name] == pytest.approx(b[name], abs=2e-3), (seed, name)
+                assert a[name] == pytest.approx(b[name], abs=2e-4), (seed, name)
 
 
 def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_path: Path) -> None:
