@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from pegasus_jax import cost, moments, scenarios
-from pegasus_jax.course import Course, either, narrowing, pace, reheated
+from pegasus_jax.course import Course, narrowing
 from pegasus_jax.fit import guarded
 from pegasus_jax.rollout import NoiseUse
 from pegasus_jax.search import keeping_best, objective, optimise, remembering, started
@@ -253,24 +253,6 @@ def test_a_search_that_loses_what_it_found_ends_with_what_it_had_at_its_turn(cal
     np.testing.assert_allclose(values[5], values[3], rtol=1e-5)
 
 
-def test_the_width_narrows_geometrically_and_stays():
-    np.testing.assert_allclose(jax.vmap(narrowing(4.0, 10))(jnp.arange(0, 25, 5)), [4, 2, 1, 1, 1], rtol=1e-6)
-
-
-def test_after_a_course_every_search_has_its_own():
-    factor = jax.vmap(reheated(lambda i: -1.0 * i, 4, 2, top=0.4, decay=0.5))(jnp.arange(9))
-    np.testing.assert_allclose(factor, [0, -1, -2, -3, 0.4, 0.3, 0.4, 0.3, 0.4], atol=1e-6)
-
-
-def test_the_pace_falls_and_begins_again_where_a_search_refines():
-    factor = pace(100, 0.2, 60)
-    np.testing.assert_allclose([factor(i) for i in (0, 30, 59.99)], [1, 0.6, 0.2], atol=1e-3)
-    np.testing.assert_allclose([factor(i) for i in (60, 80, 99.99)], [1, 0.515, 0.03], atol=1e-3)
-    np.testing.assert_allclose([pace(100, 0.2)(i) for i in (0, 50, 99.99)], [1, 0.6, 0.2], atol=1e-3)
-    np.testing.assert_allclose([pace(100, 0.2)(i) for i in (100, 300)], 0.2, atol=1e-3)  # and stays
-    assert pace(100, 1.0) is None
-
-
 def test_each_iteration_has_its_width_wherever_the_search_is_cut():
     optimizer = guarded(remembering(optax.adam(0.1)))
     pieces = dict(draw=follow, redraw=lambda key, step, held, belief: follow(key, step, belief), optimizer=optimizer)
@@ -354,13 +336,6 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     assert same(whole, learner)
     assert np.array_equal(info.objective, np.concatenate(values))
     assert len(np.unique(info.objective)) == 6
-
-
-@pytest.mark.parametrize(("asked", "slope"), [(True, 2.0), (False, np.inf)])
-def test_what_is_not_asked_for_reaches_no_gradient(asked, slope):
-    """Though it is computed, and would make NaN of a slope that is not asked for times an infinite one."""
-    double, explode = lambda x: 2.0 * x, jnp.exp
-    assert jax.jit(jax.grad(lambda x: either(jnp.asarray(asked), double, explode)(x)))(1e3) == slope
 
 
 # The best iterate
