@@ -18,6 +18,9 @@ from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.squash import SQUASHES, to_limits
 from pegasus_jax.types import Dynamics, Policy, Prediction, Task, Trajectory
 
+# What the fits and searches of a run are compiled with, and tests are not (conftest.py).
+EMITTERS = {"xla_cpu_use_fusion_emitters": True}
+
 
 class Plant(NamedTuple):
     """What the package asks of a plant, and nothing more."""

@@ -135,14 +135,15 @@ def test_tasks_of_the_users_files_have_no_shelf(cache):
 def test_a_command_given_again_traces_nothing_and_learns_the_same(tmp_path):
     """In processes of their own: the second has lowered no call of LAPACK, which moment matching needs."""
     words = [*TINY, "trials=1"]
+    places = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "XLA_FLAGS": ""}  # executables as a user's are
     runs = [tmp_path / name for name in ("first", "again")]
     for run in runs:
-        done = call("train", *words, f"out={run}", cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache"))
+        done = call("train", *words, f"out={run}", cwd=tmp_path, **places)
         assert done.returncode == 0, done.stderr
     programs = tmp_path / "cache" / "pegasus_jax" / "programs"
     files = {*programs.iterdir()}
     assert {"init", "episode", "absorb", "fit", "search1", "imagine"} <= {file.name.partition("-")[2] for file in files}
-    done = call("evaluate", runs[0], "episodes=2", cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path / "cache"))
+    done = call("evaluate", runs[0], "episodes=2", cwd=tmp_path, **places)
     assert done.returncode == 0, done.stderr
     assert {*programs.iterdir()} == files  # nor does what looks at the run
     assert fingerprint(runs[0]) == fingerprint(runs[1])

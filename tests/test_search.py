@@ -18,6 +18,7 @@ from pegasus_jax.rollout import NoiseUse
 from pegasus_jax.search import keeping_best, objective, optimise, remembering, started
 from pegasus_jax.types import Learner, Period, Scenarios, Searcher
 from probes import (
+    EMITTERS,
     PENDULUM,
     SCALAR,
     balanced_start,
@@ -323,7 +324,7 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     def search(steps):
         draws = {name: partial(getattr(scenarios, name), **pieces) for name in ("draw", "redraw")}
         function = partial(optimise, **draws, objective=value, optimizer=optimizer, steps=steps)
-        return jax.jit(function, compiler_options={"xla_cpu_use_fusion_emitters": True})
+        return jax.jit(function, compiler_options=EMITTERS)
 
     key, belief = jax.random.key(3), jnp.full((3, 2), 0.2)
     params = jnp.full((1, 2), 0.3)

@@ -20,7 +20,7 @@ from pegasus_jax import program as programs
 from pegasus_jax import record
 from pegasus_jax.build import compose
 from pegasus_jax.program import Program, over_seeds
-from probes import cart, tiny, unchecked
+from probes import EMITTERS, cart, tiny, unchecked
 from test_train import TINY, call, fingerprint, program
 
 # Fitted for longer: under a model that has hardly been, every policy costs 1, and Adam follows a gradient's rounding.
@@ -107,7 +107,7 @@ def test_how_it_is_compiled_changes_no_result() -> None:
         lowered = jax.jit(part).lower(given)
         (given, plainly), (_, as_a_run) = (
             lowered.compile(compiler_options=options)(given)
-            for options in ({}, programs.compiler_options(programs.LASTING))
+            for options in ({}, programs.compiler_options(programs.LASTING) | EMITTERS)
         )
         jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4), as_a_run, plainly)
 
