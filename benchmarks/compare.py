@@ -25,8 +25,11 @@ def ratios(new: Rows, stored: Rows) -> dict[str, float]:
 
 def main(words: list[str]) -> int:
     """The command line of this module; the exit code."""
-    new, stored = (json.loads(Path(path).read_text())["rows"] for path in (words[0], (words[1:] or [STORED])[0]))
-    found = ratios(new, stored)
+    new, stored = (json.loads(Path(path).read_text()) for path in (words[0], (words[1:] or [STORED])[0]))
+    here, there = (run["about"].get("processor") for run in (new, stored))
+    if here and there and here != there:
+        print(f"made on {here}, held against a run on {there}: their vectors and caches may differ too")
+    found = ratios(new["rows"], stored["rows"])
     if not found:
         print("the two runs have no row in common")
         return 1

@@ -11,6 +11,7 @@ import pytest
 
 from benchmarks import compare, scaling, searches, timing
 from benchmarks.workloads import SIZES, flop, products, workload
+from pegasus_jax import record
 from probes import unchecked
 
 TINY = {
@@ -28,9 +29,10 @@ def work():
     return workload(TINY, horizon=3)
 
 
-def run(path, **times):
+def run(path, about=None, **times):
     """A file of a run with these times, relative to its matrix product."""
-    path.write_text(json.dumps({"rows": {name: {"of_matmul": value} for name, value in times.items()}}))
+    rows = {name: {"of_matmul": value} for name, value in times.items()}
+    path.write_text(json.dumps({"rows": rows, "about": about or {}}))
     return str(path)
 
 
@@ -42,6 +44,16 @@ def test_a_run_fails_when_a_shared_row_is_slower_by_the_limit(new, fails, tmp_pa
     code = compare.main([run(tmp_path / "new.json", **new), run(tmp_path / "stored.json", a=10, b=2)])
     assert code == fails
     assert ("slower" in capsys.readouterr().out) == (new.get("a") == 13.1)
+
+
+def test_runs_on_two_processors_are_compared_and_that_is_said(tmp_path, capsys):
+    here = record.about("make bench")
+    assert here["processor"]
+    there = {**here, "processor": "another"}
+    new = run(tmp_path / "new.json", here, a=10)
+    for about, said in ((here, False), (there, True), ({}, False)):
+        assert compare.main([new, run(tmp_path / "stored.json", about, a=10)]) == 0
+        assert (f"made on {here['processor']}" in capsys.readouterr().out) == said
 
 
 def test_a_row_without_a_ratio_is_not_compared():

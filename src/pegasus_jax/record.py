@@ -182,9 +182,19 @@ def about(command: str) -> dict[str, Any]:
         "command": command,
         "python": sys.version.split()[0],
         "platform": platform.platform(),
+        "processor": processor(),
         "devices": [str(device) for device in jax.devices()],
         "versions": versions,
     }
+
+
+def processor() -> str:
+    """The processor's name, as far as the system tells it: what figures of speed are to be compared by."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        return next(line for line in lines if line.startswith("model name")).partition(":")[2].strip()
+    except (OSError, StopIteration):
+        return platform.processor()
 
 
 def note(run: Path, command: str, done: int) -> None:
