@@ -15,8 +15,8 @@ ROOT = Path(__file__).resolve().parents[1]
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
     0: "types checks config variants",
-    1: "angles mesh dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout episode"
-    " calibration",
+    1: "angles mesh quantile dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout"
+    " episode calibration",
     2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco",
     3: "dynamics. policy. trial",
     4: "tasks",
@@ -29,6 +29,7 @@ TOP = max(LAYERS)  # the layer that is an application: here modules may import e
 SIBLINGS: set[tuple[str, str]] = {
     ("config", "checks"),  # a setting is checked when it is made
     ("variants", "config"),  # a variant is made of settings
+    ("dropout", "quantile"),  # uniform draws, and what makes a truncated normal of them
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
     ("calibration", "angles"),  # an error of 359 degrees is one of 1
     ("moments", "mesh"),  # whether particles are whole on one GPU

@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.special import erf, log_ndtr
 
+from pegasus_jax.quantile import erf_inv, uniforms
 from pegasus_jax.types import Dropout
 
 # The log-uniform prior is improper, so its KL is known up to a constant. We fix the constant by KL -> 0 as alpha ->
@@ -24,7 +25,6 @@ from pegasus_jax.types import Dropout
 # agree.
 _LOG_UNIFORM_CONSTANT = 0.5 * (0.5772156649015329 + math.log(2.0))
 _SQRT_2 = math.sqrt(2.0)
-_UNIFORM_MARGIN = 1e-6  # base uniforms stay this far from 0 and 1, for finite quantiles in float32
 
 
 def none() -> Dropout:
@@ -88,7 +88,7 @@ def concrete(rate: float = 0.1, temperature: float = 0.1) -> Dropout:
 
     return Dropout(
         init=lambda key, width: {"logit": jnp.full((width,), start, float)},
-        sample=lambda key, width: _logit(_open_uniform(key, width)),
+        sample=lambda key, width: _logit(uniforms(key, width)),
         mask=lambda params, noise: jax.nn.sigmoid((noise - params["logit"]) / temperature),
         kl=kl,
         retain=retain,
@@ -182,7 +182,7 @@ def log_normal(
     def mask(params, noise):
         mu, sigma, alpha, beta = normal(params)
         start, end = erf(alpha / _SQRT_2), erf(beta / _SQRT_2)  # 2 Phi - 1, so the quantile is one erf_inv on (-1, 1)
-        log_z = mu + (_SQRT_2 * sigma) * jax.lax.erf_inv(start + noise * (end - start))
+        log_z = mu + (_SQRT_2 * sigma) * erf_inv(start + noise * (end - start))
         return jnp.exp(jnp.clip(log_z, low, high))  # the clip only undoes rounding
 
     def kl(params):
@@ -199,7 +199,7 @@ def log_normal(
         upper, lower = log_ndtr(beta - sigma), log_ndtr(alpha - sigma)
         return jnp.exp(mu + 0.5 * sigma**2 + upper + jnp.log1p(-jnp.exp(lower - upper))) / _mass(alpha, beta)
 
-    return Dropout(init=init, sample=_open_uniform, mask=mask, kl=kl, retain=retain, decay=_undiminished)
+    return Dropout(init=init, sample=uniforms, mask=mask, kl=kl, retain=retain, decay=_undiminished)
 
 
 def _normal(name, start, log_alpha, kl):
@@ -224,10 +224,6 @@ def _relative_variance(rate):
     if not 0.0 < rate < 1.0:
         raise ValueError(f"the initial rate must be between 0 and 1, got {rate}")
     return rate / (1.0 - rate)
-
-
-def _open_uniform(key, width):
-    return jax.random.uniform(key, (width,), minval=_UNIFORM_MARGIN, maxval=1.0 - _UNIFORM_MARGIN)
 
 
 def _logit(u):
