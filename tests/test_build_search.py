@@ -126,6 +126,18 @@ def test_after_a_stale_search_the_next_begins_from_a_fresh_policy_and_keeps_the_
     assert obstinate(stale)[1].objective[0] == info.objective[0]
 
 
+def test_a_search_that_always_begins_anew_keeps_a_policy_that_is_better():
+    """As after a stale one, but from its first search on, and whatever the search before it found."""
+    still = dict(gain=0.3, refine=0.5, learning_rate=1e-30, cost="matched", restart=True, **HELD)
+    (_, fresh, run), (_, _, usual) = searcher(anew=True, **still), searcher(**still)
+    good = -0.5 * jnp.array([[1.0, 1.6]])
+    state = fresh._replace(policy=Learner(good, fresh.policy.optimizer))
+    after, info = run(state)
+    assert info.objective[0] == usual(fresh)[1].objective[0] > usual(state)[1].objective[0]
+    assert np.array_equal(after.policy.params, good)
+    assert info.objective[-1] < info.objective[0]
+
+
 def test_after_a_search_that_found_a_better_policy_the_next_begins_from_that():
     better = dict(gain=-0.1, cost="matched", widen=1.0, learning_rate=0.02, refine=0.5, **HELD)
     _, state, run = searcher(restart=True, **better)

@@ -72,6 +72,8 @@ IMPOSSIBLE = [
     (Search, dict(learning_rate=-1e-3), "search.learning_rate=-0.001"),
     (Search, dict(clip=0.0), "search.clip=0"),
     (Search, dict(discount=1.01), "(0, 1]"),
+    (Search, dict(anew=True), "search.refine=0.5; the nearest is false"),
+    (Search, dict(anew=True, refine=0.5, restart=False), "search.restart=true"),
     (Search, dict(aggregate="sum"), "mean, total"),
     (Search, dict(state_noise=-1.0), "search.state_noise=-1"),
     (Explore, dict(trials=-1), "explore.trials=-1"),

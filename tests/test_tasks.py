@@ -26,7 +26,8 @@ SHAPES = [
 ]
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=1"]
-TINY += ["explore.trials=0", "search.refine=0"]  # the episode is the untrained policy's; half as much to compile
+# The episode is the untrained policy's; without a refining half there is half as much to compile.
+TINY += ["explore.trials=0", "search.refine=0", "search.anew=false"]
 
 
 def parse(*words: str) -> Config:

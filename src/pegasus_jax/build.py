@@ -180,6 +180,7 @@ def search_of(
             pace=step,
             settled=narrow if refine is None else refine,
             turns=() if refine is None else (refine, search.steps),
+            anew=search.anew,
         ),
     )
     if search.best:

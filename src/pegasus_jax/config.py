@@ -247,6 +247,9 @@ class Search:
     restart: bool = setting(
         True, "start a search from a fresh policy where that costs less than the old one, or the last search was stale"
     )
+    anew: bool = setting(
+        False, "start every search from a fresh policy; the old one is refined if none better is found"
+    )
     starts: int = setting(1, "policies searched side by side, the best of which goes on: the old one and fresh ones")
     sensors: str = setting("predicted", "noise on what the policy sees: as the model predicts, or the plant's: known")
     policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")
@@ -285,6 +288,8 @@ class Search:
             )
         if self.anneal > 1 and (self.refine or self.best):
             raise SettingError(f"search.anneal={self.anneal} needs search.refine=0 search.best=false")
+        if self.anew and not (self.restart and self.refine):
+            raise SettingError("search.anew=true needs search.restart=true search.refine=0.5; the nearest is false")
         if self.starts > 1 and not self.reset:
             raise SettingError(f"search.starts={self.starts} begins every search anew; it needs search.reset=true")
 

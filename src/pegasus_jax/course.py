@@ -18,6 +18,7 @@ class Course(NamedTuple):
     pace: Schedule | None = None  # a factor of the step
     settled: float = 0  # the iteration from which the objective is what the search is for
     turns: tuple[int, ...] = ()  # after so many it goes back to where it started or last turned, unless it found better
+    anew: bool = False  # it starts from its rival, whatever that costs
 
     def at(self, i: Array | int) -> tuple[Array, ...]:
         """What the objective of iteration i is told beyond policy parameters, belief and scenarios."""

@@ -136,10 +136,11 @@ def optimise(
     objective takes one more argument, the stage of the iteration; a course with turns needs a `started` optimiser.
     The course counts from `earlier`: the iterations of the searches before this one, where it goes on with theirs.
 
-    Iteration 0 goes on from the `rival`, if there is one, where that costs no more than the learner's parameters, or
-    where the search before was stale; with `reset`, with a new optimiser. At a turn, the end among them, a search goes
-    on from what it started from, or had at the turn before, unless what it has now costs less. NaN decides for the
-    older ones. What is weighed visits the loop's own objective: another one would take as long again to compile.
+    Iteration 0 goes on from the `rival`, if there is one, where that costs no more than the learner's parameters, where
+    the search before was stale, or where the course says so; with `reset`, with a new optimiser. At a turn, the end
+    among them, a search goes on from what it started from, or had at the turn before, unless what it has now costs
+    less. NaN decides for the older ones. What is weighed visits the loop's own objective: another one would take as
+    long again to compile.
     """
     optimizer = optax.with_extra_args_support(optimizer)
     weighs = bool(course.turns) or rival is not None
@@ -198,7 +199,7 @@ def optimise(
         """The learner at its own parameters, which cost `value`, or at the rival's."""
         learner, i = walk.learner, walk.iteration
         begins = i == 0
-        yields = jnp.where(begins, (walk.held <= value) | stale, ~(value < walk.held))
+        yields = jnp.where(begins, (walk.held <= value) | stale | course.anew, ~(value < walk.held))
         kept = Learner(optax.tree.where(yields, other(learner, i), learner.params), learner.optimizer)
         if not course.turns:
             return kept

@@ -93,6 +93,7 @@ _SWIMMER: dict[str, Any] = {
     "explore.trials": 5,
     "explore.kind": "walk",
     **_PLAIN_COST,
+    "search.anew": True,  # docs/decisions/0016
 }
 _LEGS: dict[int, dict[str, Any]] = {
     2: {"search.particles": 400, "fit.steps": 2000},

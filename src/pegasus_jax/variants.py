@@ -49,6 +49,7 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
         "search.refine": 0.0,
         "search.reset": False,
         "search.restart": False,
+        "search.anew": False,
     },
     "deep_pilco": {  # Alg. 2: everything redrawn every iteration, no clipping
         "model.activation": "relu",
@@ -56,6 +57,7 @@ ALGORITHMS: dict[str, dict[str, Any]] = {
         "policy.dropout": 0.1,
         "fit.learning_rate": 1e-4,
         "search.restart": False,
+        "search.anew": False,
         "search.particles": 10,
         "search.cost": "particles",
         "search.widen": 1.0,
