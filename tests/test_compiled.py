@@ -112,7 +112,8 @@ def test_a_shelf_is_that_of_its_settings_seeds_flags_and_sources(cache, monkeypa
     shelves += [compiled.shelf(config, seeds=1)]
     with jax.default_matmul_precision("float32"):
         shelves += [compiled.shelf(config, seeds=1)]
-    monkeypatch.setattr(compiled, "processor", lambda: "another")
+    known = compiled.record.processor()
+    monkeypatch.setattr(compiled.record, "processor", lambda: {**known, "flags": "others"})
     shelves += [compiled.shelf(config, seeds=1)]
     source = tmp_path / "some_plants" / "__init__.py"
     source.parent.mkdir()

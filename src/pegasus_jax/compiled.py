@@ -11,7 +11,6 @@ import hashlib
 import json
 import os
 import pickle
-import platform
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -54,17 +53,9 @@ def surroundings() -> bytes:
     config = {
         key: value for key, value in jax.config.values.items() if key != "jax_num_cpu_devices"
     }  # `about` lists them
-    known = [config, os.environ.get("XLA_FLAGS"), about, processor()]
+    executes = [record.processor().get(name) for name in ("flags", "Features")]  # as x86 and ARM call it
+    known = [config, os.environ.get("XLA_FLAGS"), about, executes]
     return json.dumps(known, sort_keys=True, default=str).encode()
-
-
-def processor() -> str:
-    """What this machine's processor can execute, as far as the system says."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
-    except OSError:
-        return f"{platform.machine()} {platform.processor()}"
-    return "\n".join(line for line in lines if line.startswith(("model name", "flags", "Features")))
 
 
 def program(path: Path, function: Wrapped, arguments: tuple, options: dict[str, Any]) -> Compiled:

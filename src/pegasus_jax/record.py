@@ -182,19 +182,20 @@ def about(command: str) -> dict[str, Any]:
         "command": command,
         "python": sys.version.split()[0],
         "platform": platform.platform(),
-        "processor": processor(),
+        "processor": processor()["model name"],
         "devices": [str(device) for device in jax.devices()],
         "versions": versions,
     }
 
 
-def processor() -> str:
-    """The processor's name, as far as the system tells it: what figures of speed are to be compared by."""
+def processor() -> dict[str, str]:
+    """What the system says of its first processor, at least its "model name"; on Linux also what it can execute."""
+    known = {"model name": f"{platform.machine()} {platform.processor()}"}
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line for line in lines if line.startswith("model name")).partition(":")[2].strip()
-    except (OSError, StopIteration):
-        return platform.processor()
+        lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+    except OSError:
+        return known
+    return known | {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
 
 
 def note(run: Path, command: str, done: int) -> None:
