@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.build import dynamics_of
-from pegasus_jax.config import BNN
+from pegasus_jax.build import blocks_of, dynamics_of, policy_of
+from pegasus_jax.config import BNN, MLP
 from pegasus_jax.dynamics.ensemble import ensemble
-from pegasus_jax.types import Batch, Dataset
+from pegasus_jax.scenarios import draw
+from pegasus_jax.types import Batch, Dataset, Period, Prediction
 from probes import cart
 
 MEMBERS = 3
@@ -56,6 +57,44 @@ def test_members_are_followed_equally_often(pair):
     belief = many.condition(params, rows())
     chosen, _ = jax.vmap(many.sample, (0, None))(jax.random.split(jax.random.key(1), 3000), belief)
     np.testing.assert_allclose(chosen.mean(0), 1 / MEMBERS, atol=4 * np.sqrt(2 / 9 / 3000))
+
+
+@pytest.mark.parametrize("particles", [2, 6, 7])
+def test_particles_together_are_what_each_would_be_alone(pair, particles):
+    """Dealt in turn, they need no other member's arithmetic; drawn one by one, they are not mistaken for dealt ones."""
+    _, many, params = pair
+    belief = many.condition(params, rows())
+    keys = lambda: jax.random.split(jax.random.key(1), particles)  # noqa: E731
+    x, u = (jax.random.normal(jax.random.key(i), (particles, width)) for i, width in enumerate((2, 1)))
+    each = jax.vmap(many.apply, (None, 0, 0, 0))
+    together = many.particles(many.apply)
+    dealt, drawn = many.deal(keys(), belief), jax.vmap(many.sample, (0, None))(keys(), belief)
+    assert np.argmax(dealt.chosen, 1).tolist() == [k % MEMBERS for k in range(particles)]
+    for draws in (dealt, drawn):
+        for one, other in zip(together(belief, draws, x, u), each(belief, draws, x, u), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
+    still = many.particles(lambda belief, draw, x, u: Prediction(0 * x, 0 * x))
+    assert not np.any(still(belief, dealt, x, u).mean)
+
+
+def test_a_dealt_particles_draw_is_of_its_member():
+    """Where noise is learned, the k-th particle's is that of member k modulo their number, drawn by its own key."""
+    member = dynamics_of(BNN(hidden=(8,), dropout="log_normal"), cart())
+    many = ensemble(member, MEMBERS)
+    belief = many.condition(many.init(jax.random.key(0)), rows())
+    dealt = many.deal(jax.random.split(jax.random.key(1), 7), belief)
+    for k, key in enumerate(jax.random.split(jax.random.key(1), 7)):
+        alone = member.sample(key, part(belief, k % MEMBERS))
+        for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(part(dealt.own, k)), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+def test_as_many_imagined_particles_follow_each_member(pair):
+    _, many, params = pair
+    belief = many.condition(params, rows())
+    task, policy = cart(), policy_of(MLP(), cart())
+    drawn = draw(jax.random.key(0), 0, belief, blocks=blocks_of(13, task, many, policy), period=Period())
+    assert drawn.dynamics.chosen.sum(0).tolist() == [5, 4, 4]
 
 
 def test_a_members_gradient_is_its_own(pair):

@@ -101,8 +101,11 @@ def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorith
     network = settings.parse({"task": "cartpole", "model": "log_normal"})
     assert network.model == BNN()
     assert own.search == network.search == CARTPOLE.search
-    for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}, {"task": "swimmer_corkscrew"}):
+    for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}):
         assert settings.parse(words) == settings.parse({"model": "log_normal", **words})
+    swimmer = {"task": "swimmer_corkscrew"}
+    five = settings.parse({**swimmer, "model": "log_normal", "model.members": "5", "model.kl_weight": "1"})
+    assert settings.parse(swimmer) == five
 
 
 def test_what_suits_a_task_best_is_the_least_of_what_is_said():

@@ -39,8 +39,10 @@ def blocks(
     so that matched particles have exactly the moments asked for. `spread` lays particles out over devices (mesh.py).
     """
 
-    def each(sample: Callable[[Key], Params]) -> Callable[[Key], Params]:
-        return lambda key: spread(jax.vmap(sample)(jax.random.split(key, particles)), 0)
+    deal = dynamics.deal or jax.vmap(dynamics.sample, (0, None))
+
+    def each(sample: Callable[[Key], Params], key: Key) -> Params:
+        return spread(sample(jax.random.split(key, particles)), 0)
 
     def normal(key: Key, _: Params) -> Array:
         states = jax.eval_shape(start, key).shape[0]
@@ -49,9 +51,9 @@ def blocks(
         return spread(standardise(z) if balanced else z, 1)
 
     return Blocks(
-        start=lambda key, _: each(start)(key),
-        dynamics=lambda key, belief: each(lambda k: dynamics.sample(k, belief))(key),
-        policy=lambda key, _: each(policy.sample)(key),
+        start=lambda key, _: each(jax.vmap(start), key),
+        dynamics=lambda key, belief: each(lambda keys: deal(keys, belief), key),
+        policy=lambda key, _: each(jax.vmap(policy.sample), key),
         sensor=normal,
         match=normal,
     )

@@ -102,8 +102,12 @@ _LEGS: dict[int, dict[str, Any]] = {
 
 
 # The model with which a task is learned best, where it is not the default one, and what is changed with it:
-# docs/decisions/0006, 0008 and 0009.
+# docs/decisions/0006, 0008, 0009 and, for the swimmer, 0017.
 BEST: dict[str, tuple[str, dict[str, Any]]] = {
+    **{
+        f"swimmer_{manoeuvre}": ("log_normal", {"model.members": 5, "model.kl_weight": 1.0})
+        for manoeuvre in get_args(Manoeuvre)
+    },
     "cartpole": ("lagrangian", {}),
     "double_cartpole": (
         "lagrangian",

@@ -101,6 +101,8 @@ class Dynamics(NamedTuple):
     apply: Callable[[Any, Params, Array, Array], Prediction]  # (belief, draw, x [D], u [U])
     # (belief, mean [F + U], cov of (encoded state, control)) -> gaussian.Image of the change of state; None: not known
     moments: Callable[[Any, Array, Array], Any] | None = None
+    # (keys [K], belief) -> draws [K, ...]: the functions of K particles together; None: `sample`, vmapped
+    deal: Callable[[Key, Any], Params] | None = None
     # apply -> the same of K particles at once, (belief, draws [K, ...], x [K, D], u [K, U]); None: vmapped
     particles: Callable[[Callable[..., Prediction]], Callable[..., Prediction]] | None = None
 

@@ -1,20 +1,31 @@
 """Several models fitted side by side, of which each particle follows one (Lakshminarayanan 2017; PETS, Chua 2018)."""
 
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 
 
+class Dealt(NamedTuple):
+    """Draws of K particles, of which the k-th follows member k modulo `members`: whose it is, its place tells."""
+
+    chosen: Array  # [K, members], 1 where a particle follows that member
+    own: Params  # [K, ...] its draw of that member
+
+
 def ensemble(member: Dynamics, members: int) -> Dynamics:
     """`members` models of one kind as one distribution over functions.
 
     They differ by their initial parameters and by their minibatches: each draws its own rows, with replacement, from
-    the batch it is given. A particle follows one member, drawn uniformly, and one draw of that member, along its whole
-    trajectory (PETS' TS-infinity).
+    the batch it is given. A particle follows one member, and one draw of that member, along its whole trajectory
+    (PETS' TS-infinity).
 
-    Every member predicts for every particle and all but one answer is dropped: `members` times the arithmetic, but in
-    the large matrix products that processors like. Giving each particle its own copy of the weights costs more.
+    A function alone follows a member drawn uniformly. The K functions of a rollout are dealt to the members in turn, so
+    that each predicts for its own particles only, with the arithmetic of one model. Where that is not known, every
+    member predicts for every particle and all but one answer is dropped; a copy of the weights each would cost more.
     """
 
     def init(key: Key) -> Params:
@@ -34,14 +45,36 @@ def ensemble(member: Dynamics, members: int) -> Dynamics:
     def condition(params: Params, data: Dataset) -> Params:
         return jax.vmap(member.condition, (0, None))(params, data)
 
+    def follow(index: Array, key: Key, belief: Params) -> tuple[Array, Params]:
+        return jax.nn.one_hot(index, members), member.sample(key, jax.tree.map(lambda leaf: leaf[index], belief))
+
     def sample(key: Key, belief: Params) -> tuple[Array, Params]:
         chosen, own = jax.random.split(key)
-        index = jax.random.randint(chosen, (), 0, members)
-        return jax.nn.one_hot(index, members), member.sample(own, jax.tree.map(lambda leaf: leaf[index], belief))
+        return follow(jax.random.randint(chosen, (), 0, members), own, belief)
+
+    def deal(keys: Key, belief: Params) -> Dealt:
+        return Dealt(*jax.vmap(follow, (0, 0, None))(jnp.arange(len(keys)) % members, keys, belief))
 
     def apply(belief: Params, draw: tuple[Array, Params], x: Array, u: Array) -> Prediction:
         chosen, own = draw
         mean, std = jax.vmap(member.apply, (0, None, None, None))(belief, own, x, u)
         return Prediction(chosen @ mean, chosen @ std)
 
-    return Dynamics(init, member.prepare, loss, condition, sample, apply)
+    def particles(given: Callable[..., Prediction]) -> Callable[..., Prediction]:
+        def together(belief: Params, draws: Any, x: Array, u: Array) -> Prediction:
+            if given is not apply or not isinstance(draws, Dealt):
+                return jax.vmap(given, (None, 0, 0, 0))(belief, draws, x, u)
+            rounds = -(-len(x) // members)
+            filled = jnp.arange(rounds * members) % len(x)  # a last round that is not whole begins again, for nobody
+
+            def split(rows: Array) -> Array:
+                whole = rows if len(filled) == len(x) else rows[filled]
+                return whole.reshape(rounds, members, *rows.shape[1:])
+
+            each = jax.vmap(jax.vmap(member.apply, (None, 0, 0, 0)), (0, 1, 1, 1), 1)
+            answers = each(belief, *jax.tree.map(split, (draws.own, x, u)))
+            return jax.tree.map(lambda answer: answer.reshape(-1, *answer.shape[2:])[: len(x)], answers)
+
+        return together
+
+    return Dynamics(init, member.prepare, loss, condition, sample, apply, deal=deal, particles=particles)
