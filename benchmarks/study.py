@@ -17,8 +17,8 @@ from pegasus_jax.study import seed_list, study, table, write
 RESULTS = Path(__file__).parent / "results"
 
 
-def main(words: list[str]) -> None:
-    """The command line of this module."""
+def main(words: list[str], module: str = "benchmarks.study") -> None:
+    """The command line of this module, or of another that changes what it runs."""
     name, *rest = words
     options, dotted = settings.split(rest, ("seeds",))
     config = settings.parse(dotted)
@@ -27,7 +27,7 @@ def main(words: list[str]) -> None:
     seeds = seed_list(options.get("seeds", "0-9"))
     share_processors(len(seeds))
     result = study(config, seeds, path)
-    result["about"] = about(shlex.join(["python", "-m", "benchmarks.study", *words]))
+    result["about"] = about(shlex.join(["python", "-m", module, *words]))
     write(path, result)
     print(f"## {name}: compiled in {result['compile_seconds']} s, ran {result['run_seconds']} s")
     print(table(result), flush=True)

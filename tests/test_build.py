@@ -244,21 +244,14 @@ def test_a_gpus_products_have_single_precision_unless_it_was_told(monkeypatch, u
         (config.RBF(), {}, "model=ssgp"),
         (config.MLP(), {"dynamics": True}, "policy=rbf, policy=linear"),
         (config.RBF(squash="tanh"), {"dynamics": True}, "policy=rbf"),
-        (config.RBF(), {"dynamics": True, "task": True}, "closed form"),
     ],
 )
 def test_pilco_without_moments_is_refused(policy, pieces, part):
     """Naming what has them."""
     model = gp(states=2, controls=1, angles=()) if "dynamics" in pieces else None
-    task = cart()._replace(expected_cost=None) if "task" in pieces else cart()
     with pytest.raises(SettingError, match=part) as caught:
-        compose(dataclasses.replace(tiny(), policy=policy, search=ANALYTIC), task, dynamics=model)
+        compose(dataclasses.replace(tiny(), policy=policy, search=ANALYTIC), cart(), dynamics=model)
     assert "\n" not in str(caught.value)
-
-
-def test_a_cost_without_an_expectation_cannot_be_matched():
-    with pytest.raises(SettingError, match=r"search\.cost=matched needs"):
-        compose(dataclasses.replace(tiny(), search=config.Search(cost="matched")), cart()._replace(expected_cost=None))
 
 
 def test_the_settings_of_pilcos_search_reach_its_objective():
@@ -266,15 +259,20 @@ def test_the_settings_of_pilcos_search_reach_its_objective():
     dynamics = known(PENDULUM, noise_std=0.2)._replace(moments=lambda _, mean, cov: affine(mean, cov, change))
     policy = linear_policy(2, 1)._replace(moments=lambda gain, mean, cov: affine(mean, cov, gain))
 
-    def value(**search):
+    def value(task, **search):
         chosen = dataclasses.replace(ANALYTIC, **{"policy_noise": 0.0, "state_noise": 0.0, **search})
-        searcher, _ = search_of(chosen, cart(horizon=3), dynamics, policy)
+        searcher, _ = search_of(chosen, task, dynamics, policy)
         params = jnp.full((1, 2), -0.5)
         run = jax.jit(partial(searcher.run, first=0, steps=1))
         return float(run(jax.random.key(0), Learner(params, searcher.init(params)), None)[1].objective[0])
 
-    plain = value()
-    np.testing.assert_allclose(value(aggregate="total"), 3 * plain, rtol=1e-4)
-    values = [value(discount=0.5), *(value(**{f"{name}_noise": 1.0}) for name in ("policy", "state", "cost"))]
+    of_cart = partial(value, cart(horizon=3))
+    plain = of_cart()
+    np.testing.assert_allclose(of_cart(aggregate="total"), 3 * plain, rtol=1e-4)
+    values = [of_cart(discount=0.5), *(of_cart(**{f"{name}_noise": 1.0}) for name in ("policy", "state", "cost"))]
     assert all(abs(value - plain) > 1e-4 for value in values), (plain, values)
     assert len(set(values)) == 4
+    # And so does a cost that is only a function.
+    own = value(cart(horizon=3)._replace(expected_cost=None))
+    assert own != plain
+    assert own == pytest.approx(plain, rel=0.01)

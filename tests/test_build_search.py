@@ -14,6 +14,7 @@ from jax.flatten_util import ravel_pytree
 from pegasus_jax import config, cost, moments, scenarios, types
 from pegasus_jax.build import (
     compose,
+    costs_of,
     dynamics_of,
     fit_of,
     start,
@@ -224,6 +225,19 @@ def test_a_cost_without_a_width_cannot_be_widened():
     task = cart(horizon=2)._replace(widened=None)
     with pytest.raises(SettingError, match=r"search\.widen=4 needs a cost with a width.*the nearest is 1"):
         compose(tiny(), task)
+
+
+def test_the_matched_cost_of_any_function_is_that_of_its_nodes():
+    """Near the closed form of the same cost, which was not asked for; and of no width."""
+    task, search = cart(horizon=3), config.Search(cost="matched", widen=1)
+    x = 0.4 * jax.random.normal(jax.random.key(0), (3, 20, len(task.state_names)))
+    own = costs_of(search, task._replace(expected_cost=None))(None, None)(x)
+    known = costs_of(search, task)(None, None)(x)
+    assert own.shape == (3, 1)
+    by_nodes = cost.expected_by_nodes(task.cost, len(task.state_names))
+    np.testing.assert_allclose(own, cost.of_matched(by_nodes)(x), rtol=1e-6)
+    assert np.all(own != known)
+    np.testing.assert_allclose(own, known, atol=0.03)
 
 
 def test_truncation_reaches_the_gradient_and_only_that():

@@ -135,6 +135,48 @@ def test_the_expected_cost_against_samples(name, x64):
     assert float(expected) == pytest.approx(float(of_states.mean()), abs=0.02)
 
 
+@pytest.mark.parametrize("size", [1, 4, 13])
+def test_nodes_have_the_moments_of_a_standard_normal(size):
+    """The first two exactly; the others nearly, where chance would be five times as far off."""
+    z = cost.normal_nodes(512, size)
+    np.testing.assert_allclose(z.mean(0), 0, atol=1e-12)
+    np.testing.assert_allclose(z.T @ z / 512, np.eye(size), atol=1e-12)
+    np.testing.assert_allclose(np.mean(z**3, 0), 0, atol=0.06)
+    np.testing.assert_allclose(np.mean(z**4, 0), 3, atol=0.2)
+
+
+def test_the_expectation_by_nodes_of_a_quadratic_cost_is_exact(x64):
+    noise = np.random.default_rng(5)
+    (mean, slope), root, curve = noise.normal(size=(2, 3)), noise.normal(size=(3, 3)), noise.normal(size=(3, 3))
+    cov = root @ root.T
+    expected = jax.jit(cost.expected_by_nodes(lambda x: x @ curve @ x + slope @ x + 7, 3))(mean, cov)
+    known = mean @ curve @ mean + np.trace(curve @ cov) + slope @ mean + 7
+    np.testing.assert_allclose(expected, known, rtol=1e-10)
+
+
+@pytest.mark.parametrize("name", GOALS)
+def test_the_expectation_by_nodes_against_the_closed_form(name, x64):
+    """And its gradient, which a search follows; the hundred particles of a search are several times as far off."""
+    plant = PLANTS[name]()
+    states, noise = len(plant.state_names), np.random.default_rng(6)
+    by_nodes = cost.expected_by_nodes(cost.saturating(lambda x: x[:2] - 0.3, 0.5), states)
+    closed = cost.expected_saturating(lambda x: x[:2] - 0.3, 0.5, ())
+    root = 0.4 * noise.normal(size=(states, states))
+    mean, cov = 0.5 * noise.normal(size=states), root @ root.T
+    near, exact = (jax.jit(jax.value_and_grad(f, (0, 1)))(mean, cov) for f in (by_nodes, closed))
+    assert 0.05 < float(exact[0]) < 0.95
+    assert float(near[0]) == pytest.approx(float(exact[0]), abs=0.01)
+    np.testing.assert_allclose(near[1][0][:2], exact[1][0][:2], atol=0.03)
+    np.testing.assert_allclose(near[1][0][2:], 0, atol=1e-12)
+
+    def of_chance(seed: int) -> float:
+        x = np.random.default_rng(seed).multivariate_normal(mean, cov, 100)
+        return float(jnp.mean(jax.vmap(cost.saturating(lambda x: x[:2] - 0.3, 0.5))(x)))
+
+    off = np.std([of_chance(seed) for seed in range(20)])
+    assert abs(float(near[0]) - float(exact[0])) < off / 3
+
+
 def test_the_cost_of_a_task_and_its_expectation_agree_where_the_state_is_known(x64):
     task = tasks.make("double_cartpole")
     x = np.random.default_rng(2).normal(size=(20, 6)) * 0.3

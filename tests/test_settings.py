@@ -179,6 +179,14 @@ def test_a_variant_brings_defaults_that_single_settings_change():
         assert chosen.search == dataclasses.replace(plain, period=Period(1, 1, 1, 1, 0))
 
 
+@pytest.mark.parametrize("words", [("task=gym", "env=Pendulum-v1"), ("task=mjcf", "mjcf=arm.xml")])
+def test_a_cost_of_ones_own_is_matched_and_not_widened(words):
+    """docs/decisions/0018; the paper's search follows each particle's, on every task."""
+    chosen = parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9").search
+    assert (chosen.cost, chosen.widen, chosen.balanced, chosen.refine) == ("matched", 1, True, 0.5)
+    assert parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9", "algorithm=paper").search.cost == "particles"
+
+
 def test_the_paper_is_a_variant():
     """Alg. 3 and docs/reference.md 1.2, 4.7, 5.2, 5.5: all draws but the start held for the whole search."""
     chosen = parse("algorithm=paper")

@@ -231,7 +231,7 @@ def analytic_search_of(
             noise=noise,
         )
 
-    begin, expected = (mean, jnp.diag(std**2)), expected_cost_of(task, "algorithm=pilco")
+    begin, expected = (mean, jnp.diag(std**2)), expected_cost_of(task)
     blocks = blocks_of(search.particles, task, dynamics, policy)
     imagine = partial(imagined, **pieces, blocks=blocks, cost=task.cost, match=moments.keep, noise=noise)
     return pilco.analytic(value, noise_std), imagine
@@ -240,10 +240,8 @@ def analytic_search_of(
 def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Array | None], Callable[[Array], Array]]:
     """(whether this refines, a factor of the cost's width; None: never) -> costs [H, K] or [H, 1] of states [H, K, D].
 
-    Raises SettingError where the task's cost has no expectation or no width.
+    Raises SettingError where the task's cost has no width.
     """
-    if search.cost == "matched":
-        expected_cost_of(task, "search.cost=matched")
     if search.widen > 1 and task.widened is None:
         raise SettingError(
             f"search.widen={search.widen:g} needs a cost with a width, which that of task={task.name} lacks;"
@@ -251,24 +249,20 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
         )
 
     def costs(refining: Array | None, width: Array | None) -> Callable[[Array], Array]:
-        of_state, expected = task.cost, task.expected_cost
+        of_state, expected = task.cost, expected_cost_of(task)
         if width is not None and task.widened is not None:
             of_state, expected = task.widened(width)
         each = cost.of_particles(of_state)
-        if search.cost != "matched" or expected is None:
+        if search.cost != "matched":
             return each
         return either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), cost.of_matched(expected))
 
     return costs
 
 
-def expected_cost_of(task: Task, setting: str) -> cost.Expected:
-    """The task's expected cost of a Gaussian state. Raises SettingError, naming the setting, where it is not known."""
-    if task.expected_cost is None:
-        raise SettingError(
-            f"{setting} needs a cost whose expectation is known in closed form, and that of task={task.name} is not"
-        )
-    return task.expected_cost
+def expected_cost_of(task: Task) -> cost.Expected:
+    """The task's expected cost of a Gaussian state: in closed form where that is known, else by nodes."""
+    return task.expected_cost or cost.expected_by_nodes(task.cost, len(task.state_names))
 
 
 def discounted(search: settings.Search | settings.Analytic, aggregate: cost.Aggregate) -> cost.Aggregate:

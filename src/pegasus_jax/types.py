@@ -138,7 +138,7 @@ class Task(NamedTuple):
     # The entries of x that are rates of its other entries, in the order of those; (): x is not made of such pairs.
     rates: tuple[int, ...] = ()
     success: float = 0.2  # a rollout whose last five steps cost less than this on average has succeeded
-    # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not known in closed form
+    # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not in closed form, but by cost.expected_by_nodes
     expected_cost: Callable[[Array, Array], Array] | None = None
     # A factor -> (cost, expected_cost) of the same error with that many times the width. None: the cost has no width.
     widened: Callable[[Array], tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]] | None = None

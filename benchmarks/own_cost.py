@@ -1,0 +1,24 @@
+"""A learning study whose search knows the task's cost as one of a user's: neither its expectation nor its width.
+
+    python -m benchmarks.own_cost NAME seeds=0-49 task=cartpole model=log_normal trials=15 search.widen=1
+
+Words and file as in benchmarks.study; `search.cost=particles` follows the cost of each particle.
+"""
+
+import sys
+from typing import Any
+
+from benchmarks import study
+from pegasus_jax import tasks
+
+POSED = tasks.of_plant
+
+
+def of_plant(name: str, plant: Any) -> Any:
+    """The task that a plant poses to someone who knows its cost only as a function."""
+    return POSED(name, plant)._replace(expected_cost=None, widened=None)
+
+
+if __name__ == "__main__":
+    tasks.of_plant = of_plant
+    study.main(sys.argv[1:], "benchmarks.own_cost")
