@@ -64,11 +64,11 @@ def widened(error: Error, width: float, angles: tuple[int, ...], factor: Array |
 
 
 def expected_by_nodes(cost: Cost, states: int, nodes: int = 512) -> Expected:
-    """The expectation of any cost of a Gaussian state x [D]: the mean over as many fixed nodes, more than D of them.
+    """The expectation of any cost of a Gaussian state x [D]: the mean over as many fixed nodes, at least 2 D.
 
     Quasi-Monte Carlo with `normal_nodes`: exact for a cost that is a constant, linear or quadratic in x.
     """
-    z = normal_nodes(nodes, states)
+    z = normal_nodes(max(nodes, 2 * states), states)
 
     def expected(mean: Array, cov: Array) -> Array:
         return jnp.mean(jax.vmap(cost)(mean + z.astype(mean.dtype) @ cholesky(cov).T))
@@ -82,7 +82,7 @@ def normal_nodes(count: int, size: int) -> np.ndarray:
 
     The normal's quantiles of Sobol's sequence, each moved to the middle of its interval, as none may be at 0.
     """
-    from scipy.stats import norm, qmc  # takes a third of a second, which only a cost of one's own needs
+    from scipy.stats import norm, qmc  # slow to import, and only a cost of one's own needs them
 
     intervals = 2 ** (count - 1).bit_length()
     z = norm.ppf(qmc.Sobol(size, scramble=False).random(count) + 0.5 / intervals)
