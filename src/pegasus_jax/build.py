@@ -249,14 +249,13 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
         )
 
     def costs(refining: Array | None, width: Array | None) -> Callable[[Array], Array]:
-        of_state, expected = task.cost, task.expected_cost
+        of_state, expected = task.cost, expected_cost_of(task)
         if width is not None and task.widened is not None:
             of_state, expected = task.widened(width)
         each = cost.of_particles(of_state)
         if search.cost != "matched":
             return each
-        matched = cost.of_matched(expected or expected_cost_of(task))
-        return either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), matched)
+        return either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), cost.of_matched(expected))
 
     return costs
 

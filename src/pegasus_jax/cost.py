@@ -68,9 +68,9 @@ def expected_by_nodes(cost: Cost, states: int, nodes: int = 512) -> Expected:
 
     Quasi-Monte Carlo with `normal_nodes`: exact for a cost that is a constant, linear or quadratic in x.
     """
-    z = normal_nodes(max(nodes, 2 * states), states)
 
     def expected(mean: Array, cov: Array) -> Array:
+        z = normal_nodes(max(nodes, 2 * states), states)
         return jnp.mean(jax.vmap(cost)(mean + z.astype(mean.dtype) @ cholesky(cov).T))
 
     return expected
