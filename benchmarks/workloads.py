@@ -22,7 +22,7 @@ from pegasus_jax.search import objective
 from pegasus_jax.types import Array, Experiment, Params, Period, RunState, Scenarios, Task, Trajectory
 
 # Every iteration alike, as the paper's and the peers' are: what a search refines by is another program.
-ALIKE = {"search.balanced": "false", "search.refine": "0"}
+ALIKE = {"search.balanced": "false", "search.refine": "0", "search.anew": "false"}
 SIZES = {
     "cart-pole": {
         "task": "cartpole",
