@@ -1,14 +1,18 @@
 """What every test shares: key reuse is an error, property tests are repeatable, and float64 is one fixture away."""
 
 import os
+from importlib.metadata import version
 
 # Before jax loads LAPACK: two test processes on two cores, each with a thread a core that spins while it waits, made a
 # Cholesky factor of 375 rows take a second instead of a millisecond.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # Compile faster to slower code, here and in the processes that tests start: their programs are many and tiny. The flag,
-# which the programs of a run have where they are brief (program.BRIEFLY), halves what is left.
+# which the programs of a run have where they are brief (program.BRIEFLY), halves what is left; later compilers have it
+# no more, and end a process that is given it.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-os.environ["XLA_FLAGS"] = f"--xla_cpu_use_fusion_emitters=false {os.environ.get('XLA_FLAGS', '')}".strip()
+os.environ["XLA_FLAGS"] = " ".join(
+    ["--xla_cpu_use_fusion_emitters=false"] * (version("jaxlib") < "0.11") + os.environ.get("XLA_FLAGS", "").split()
+)
 
 import jax
 import pytest

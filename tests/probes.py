@@ -4,6 +4,7 @@ A probe is a `types.Task` whose plant is three lines of algebra. Where the answe
 computed here in NumPy, independently of the package.
 """
 
+import os
 from functools import cache, partial
 from typing import Any, NamedTuple
 
@@ -18,8 +19,9 @@ from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.squash import SQUASHES, to_limits
 from pegasus_jax.types import Dynamics, Policy, Prediction, Task, Trajectory
 
-# What the fits and searches of a run are compiled with, and tests are not (conftest.py).
-EMITTERS = {"xla_cpu_use_fusion_emitters": True}
+# What the fits and searches of a run are compiled with, and tests are not where they have the choice (conftest.py).
+_SWITCH = "xla_cpu_use_fusion_emitters"
+EMITTERS = {_SWITCH: True} if _SWITCH in os.environ.get("XLA_FLAGS", "") else {}
 
 
 class Plant(NamedTuple):

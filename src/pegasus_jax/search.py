@@ -1,7 +1,7 @@
 """Policy search: follow the gradient of the imagined cost under held scenarios (Alg. 3)."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import partial, reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -153,7 +153,8 @@ def optimise(
         learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, start=start))
 
     def turns(i: Array) -> Array:
-        return jnp.any(i == jnp.asarray(course.turns, jnp.int32))
+        # One by one: jaxlib 0.11 crashes on an array of no turns where seeds are shared out over devices.
+        return reduce(jnp.logical_or, [i == turn for turn in course.turns], jnp.zeros((), bool))
 
     def other(learner: Learner, i: Array) -> Params:
         """What the learner's parameters are weighed against."""
