@@ -11,8 +11,11 @@ import jax
 import numpy as np
 import pytest
 
-from pegasus_envs.guest import guest
-from pegasus_jax import record, settings
+from pegasus_envs.guest import facts, guest
+from pegasus_jax import program, record, settings
+from pegasus_jax.build import build, compose
+from pegasus_jax.config import Config, Search
+from probes import cart, tiny
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
 COSTS = """
@@ -53,7 +56,7 @@ def test_an_environment_not_written_for_us(env: str, cost: str, states: int, lim
 
 def test_a_guest_obeys_gymnasium() -> None:
     """Reset by key is reset by a seed, and steps come in order, in compiled code."""
-    plant = guest("Pendulum-v1")
+    plant = guest("Pendulum-v1", facts("Pendulum-v1"))
     controls = np.linspace(-2, 2, 12, dtype=np.float32)[:, None]
 
     @jax.jit
@@ -91,7 +94,7 @@ class Fragile(gymnasium.Env):
 
 def test_an_environment_rests_once_it_has_ended() -> None:
     gymnasium.register("Fragile-v0", Fragile)
-    plant = guest("Fragile-v0")
+    plant = guest("Fragile-v0", facts("Fragile-v0"))
 
     @jax.jit
     def run(key: jax.Array) -> jax.Array:
@@ -100,6 +103,15 @@ def test_an_environment_rests_once_it_has_ended() -> None:
 
     for seed in range(2):  # a reset begins anew
         np.testing.assert_array_equal(run(jax.random.key(seed)), [1, 2, 3, 3, 3, 3])
+
+
+def test_an_environment_is_never_asked_for_two_episodes_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A GPU evaluates a plant in JAX twenty times side by side."""
+    config = Config(task="gym", env="Pendulum-v1", cost="math:cos", start_mean=(0.0,), search=Search(widen=1.0))
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    monkeypatch.setattr(program, "compiler_options", lambda _: {})
+    assert not program.Program(build(config), 1).side_by_side
+    assert program.Program(compose(tiny(), cart()), 1).side_by_side
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 
 from pegasus_envs.physics import mjx
-from pegasus_envs.plant import FRAME, draw_start
+from pegasus_envs.plant import FRAME, draw_start, filled
 
 _ENTRY = re.compile(r"(qpos|qvel)\.(\d+)")
 _UNITS = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
@@ -85,8 +85,8 @@ def mechanism(
         near = max(count, 1) * model.opt.timestep
         raise ValueError(f"dt={dt:g} is not a whole number of its time steps of {model.opt.timestep:g} s; try {near:g}")
     rest = np.concatenate([model.qpos0, np.zeros(model.nv)])
-    mean = _filled("start_mean", start_mean, len(entries), rest[entries])
-    std = _filled("start_std", start_std, len(entries), np.zeros(len(entries)))
+    mean = filled("start_mean", start_mean, len(entries), rest[entries])
+    std = filled("start_std", start_std, len(entries), np.zeros(len(entries)))
     device, blank = _on_device(model)
 
     def place(x: Array) -> Moving:
@@ -188,8 +188,8 @@ def _rates(model: mujoco.MjModel, entries: np.ndarray) -> tuple[int, ...]:
 def _limits(model: mujoco.MjModel, low: Sequence[float], high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest controls [U], and where neither the user nor the file names them, a refusal."""
     ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, [-np.inf, np.inf])
-    lows = _filled("control_low", low, model.nu, ranges[:, 0])
-    highs = _filled("control_high", high, model.nu, ranges[:, 1])
+    lows = filled("control_low", low, model.nu, ranges[:, 0])
+    highs = filled("control_high", high, model.nu, ranges[:, 1])
     for i, (least, greatest) in enumerate(zip(lows, highs, strict=True)):
         if not (np.isfinite(least) and np.isfinite(greatest)):
             name = model.actuator(i).name or i
@@ -197,13 +197,6 @@ def _limits(model: mujoco.MjModel, low: Sequence[float], high: Sequence[float]) 
         if not least < greatest:
             raise ValueError(f"control_low={least:g} must be less than control_high={greatest:g}")
     return lows, highs
-
-
-def _filled(name: str, given: Sequence[float], size: int, default: np.ndarray) -> np.ndarray:
-    """The numbers given, one for all or one each, or the default."""
-    if len(given) not in (0, 1, size):
-        raise ValueError(f"{name} has {len(given)} entries; expected {size}, or one for all")
-    return np.broadcast_to(np.asarray(given, float), (size,)).copy() if len(given) else np.asarray(default, float)
 
 
 def _state_names(model: mujoco.MjModel) -> list[str]:

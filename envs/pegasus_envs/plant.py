@@ -1,6 +1,6 @@
 """A plant: the physical system to be controlled, as a tuple of pure functions and of static facts about it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -76,6 +76,13 @@ def gliding(move: Callable[[State, Array], State], dt: float) -> Callable[[State
 def draw_start(key: Array, mean: np.ndarray, std: np.ndarray) -> Array:
     """One start x [D] from N(mean, diag(std^2))."""
     return jnp.asarray(mean) + jnp.asarray(std) * jax.random.normal(key, mean.shape)
+
+
+def filled(setting: str, given: Sequence[float], size: int, default: np.ndarray) -> np.ndarray:
+    """The numbers given for a setting, one for all or one each [size], or the default. Raises ValueError for others."""
+    if len(given) not in (0, 1, size):
+        raise ValueError(f"{setting} has {len(given)} entries; expected {size}, or one for all")
+    return np.broadcast_to(np.asarray(given, float), (size,)).copy() if len(given) else np.asarray(default, float)
 
 
 def simulate(plant: Plant, state: State, controls: Array) -> Array:

@@ -14,8 +14,8 @@ from pegasus_jax.config import Config, Search
 
 TRAIN = """\
 pegasus-train task=NAME [setting=value ...]     learn a controller
-pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that was killed; or with other fit.* or
-                                                search.* settings
+pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that was killed; or with other evaluation=,
+                                                fit.* or search.* settings
 
   task=cartpole         what to learn: {tasks}
   model=log_normal      dynamics model: {models};
@@ -40,6 +40,7 @@ examples
   pegasus-train task=cartpole algorithm=deep_pilco search.clip=1
   pegasus-train task=swimmer_corkscrew legs=6
   pegasus-train task=gym env=Pendulum-v1 cost=mymodule:cost horizon=40
+  pegasus-train task=gym env=robot:Arm-v0 cost=robot:cost start_mean=[3.14,0] evaluation=0       (a robot)
   pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
   pegasus-train resume=runs/demo trials=20 search.steps=2000
 
@@ -138,7 +139,9 @@ def _train(words: Sequence[str]) -> None:
     command = shlex.join(["pegasus-train", *words])
     if "resume" in options:
         if wrong := sorted(key for key in {*rest, *options} - {"resume", *OPTIONS[3:]} if not _changeable(key)):
-            raise SettingError(f"{wrong[0]} cannot be changed by resume=; only trials=, fit.* and search.* can")
+            raise SettingError(
+                f"{wrong[0]} cannot be changed by resume=; only trials=, evaluation=, fit.* and search.* can"
+            )
         home = Path(options["resume"])
         runs = record.seeds_of(home)
         first = record.existing(next(iter(runs.values()), home))
@@ -191,7 +194,7 @@ def _shelf(config: Config, seeds: int) -> Path | None:
 
 def _changeable(key: str) -> bool:
     """Whether a run can go on with another value of this setting: what it has learned stays what it is."""
-    return key == "trials" or key.startswith(("fit.", "search."))
+    return key in ("trials", "evaluation") or key.startswith(("fit.", "search."))
 
 
 def _join(options: dict[str, str]) -> None:

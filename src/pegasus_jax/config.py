@@ -345,15 +345,26 @@ class Config:
     cost: str | None = setting(None, "of task=gym|mjcf: module:function, observation [D] -> cost in [0, 1], in JAX")
     angles: tuple[int, ...] = setting((), "of task=gym|mjcf: the entries of the observation that are angles [rad]")
     rates: tuple[int, ...] = setting((), "of task=gym: the entries that are the other entries' rates, in their order")
-    horizon: int | None = setting(None, "of task=gym|mjcf: control periods an episode; null: a gym's own limit")
-    dt: float | None = setting(None, "of task=mjcf: control period [s], a whole number of the file's time steps")
+    horizon: int | None = setting(None, "of task=gym|mjcf: control periods an episode; null: a gym's own limit, or 100")
+    dt: float | None = setting(
+        None, "of task=gym|mjcf: control period [s]; null: a gym's own. A whole number of an mjcf's time steps"
+    )
     observe: tuple[str, ...] = setting((), "of task=mjcf: as [qpos.0,qvel.1]; []: all positions, then all velocities")
-    control_low: tuple[float, ...] = setting((), "of task=mjcf: least controls; []: the file's ctrlrange")
-    control_high: tuple[float, ...] = setting((), "of task=mjcf: greatest controls; []: the file's ctrlrange")
-    start_mean: tuple[float, ...] = setting((), "of task=mjcf: of the observation; []: the file's pose, at rest")
-    start_std: tuple[float, ...] = setting((0.1,), "of task=mjcf: spread of the starts, one for all or one each")
+    control_low: tuple[float, ...] = setting(
+        (), "of task=gym|mjcf: least controls; []: the action space's, the file's ctrlrange"
+    )
+    control_high: tuple[float, ...] = setting(
+        (), "of task=gym|mjcf: greatest controls; []: the action space's, the file's ctrlrange"
+    )
+    start_mean: tuple[float, ...] = setting(
+        (), "of task=gym|mjcf: of the observation; []: of 100 resets, the file's pose at rest"
+    )
+    start_std: tuple[float, ...] = setting(
+        (0.1,), "of task=gym|mjcf: spread of the starts around start_mean, one for all or one each"
+    )
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
+    evaluation: int = setting(20, "episodes after each trial that only measure the policy; 0: none, as for a robot")
     precision: str = setting("single", "of all numbers: single (32 bits) or double (64)")
     model: Model = BNN()
     policy: MLP | RBF | Linear = MLP()
@@ -374,3 +385,4 @@ class Config:
             checks.within("horizon", self.horizon, 1)
         checks.within("seed", self.seed, 0, 2**32 - 1)
         checks.within("trials", self.trials, 1, 10_000)
+        checks.within("evaluation", self.evaluation, 0)

@@ -85,8 +85,9 @@ class Program:
     ) -> None:
         self.mesh, self.seeds = over, seeds
         # Evaluation episodes. A GPU takes as long for one as for twenty; a processor does not, and would have one
-        # more program to compile.
-        self.side_by_side = jax.default_backend() != "cpu" if side_by_side is None else side_by_side
+        # more program to compile. Of a plant on the host, whose trouble is kept there, there is one.
+        able = jax.default_backend() != "cpu" and not hasattr(experiment.task.plant, "trouble")
+        self.side_by_side = able if side_by_side is None else side_by_side
         self.chunk = chunk(search_steps)
         self.chunks = search_steps // self.chunk
         functions = {

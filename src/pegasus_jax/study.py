@@ -38,6 +38,8 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
         raise SettingError(
             "task=gym cannot be studied as one program: its environment is one object; use pegasus-train"
         )
+    if not config.evaluation:
+        raise SettingError("evaluation=0 leaves a study nothing to compare; the nearest is 1")
     set_precision(config)
     experiment = build(config)
     over = mesh.evenly(len(seeds))
@@ -52,7 +54,7 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
     states = jax.jit(each(experiment.init, (0,), SEEDS), out_shardings=laid_out)(keys)
     began = time.monotonic()
-    one = each(lambda state: trial(state, experiment), (SEEDS,), (SEEDS, 0))
+    one = each(lambda state: trial(state, experiment, config.evaluation), (SEEDS,), (SEEDS, 0))
     lowered = jax.jit(one, out_shardings=(laid_out, own)).lower(states)
     how = compiler_options(LASTING)
     program = lowered.compile(compiler_options=how)

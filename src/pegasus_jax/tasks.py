@@ -15,7 +15,7 @@ from pegasus_envs import mjcf
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.goals import Task as Manoeuvre
-from pegasus_envs.guest import guest
+from pegasus_envs.guest import Facts, facts, guest
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
@@ -202,7 +202,21 @@ def label(config: Config) -> str:
 
 
 def pinned(config: Config) -> Config:
-    """The config for a run's folder: it finds its MJCF file from anywhere, and knows it by its content."""
+    """The config for a run's folder: it finds its MJCF file from anywhere, and knows it by its content.
+
+    That of a Gymnasium environment says all that has to be known of it, so that whoever reads the folder, or goes on
+    with it, neither opens nor resets it: it may be a robot.
+    """
+    if config.task == GYM:
+        _complete(config)
+        try:
+            known = facts(config.env or "", **{name: getattr(config, name) for name in Facts._fields})
+        except ValueError as error:
+            raise SettingError(f"env={config.env}: {error}") from error
+        plain = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known._asdict().items()
+        }
+        return dataclasses.replace(config, **plain)
     if config.task != MJCF or config.mjcf is None:
         return config
     return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf), mjcf_digest=mjcf.digest(_model(config)))
@@ -210,16 +224,24 @@ def pinned(config: Config) -> Config:
 
 def of_guest(config: Config) -> Task:
     """The task that a Gymnasium environment and a cost of its observations pose. Raises SettingError if they cannot."""
-    if config.env is None or config.cost is None:
-        raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
-    try:
-        plant = guest(config.env)
-    except ValueError as error:
-        raise SettingError(f"env={config.env}: {error}") from error
+    _complete(config)
+    known: dict[str, Any] = {name: getattr(config, name) for name in Facts._fields}
+    if any(value in (None, ()) for value in known.values()):
+        return of_guest(pinned(config))
+    known |= {name: np.array(value, float) for name, value in known.items() if isinstance(value, tuple)}
+    name = config.env or ""
+    plant = guest(name, Facts(**known))
     states = tuple(f"x{i}" for i in range(len(plant.start_mean)))
     controls = tuple(f"u{i}" for i in range(len(plant.control_low)))
-    task = _of_users(config, config.env, plant, config.horizon or plant.horizon, states, controls)
-    return task._replace(rates=_entries("rates", config.rates, config.env, len(states)))
+    task = _of_users(config, name, plant, plant.horizon, states, controls)
+    return task._replace(rates=_entries("rates", config.rates, name, len(states)))
+
+
+def _complete(config: Config) -> None:
+    """Raises SettingError unless both an environment and a cost are named."""
+    if config.env is None or config.cost is None:
+        raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
+    _look_here()
 
 
 def of_mjcf(config: Config) -> Task:
@@ -280,10 +302,15 @@ def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> 
     return entries
 
 
-def _function(name: str) -> Callable[[Any], Any]:
-    """The function `module:function`, also from a module in the working folder."""
+def _look_here() -> None:
+    """Let modules in the working folder be found, as by `python -m`."""
     if os.getcwd() not in sys.path:
         sys.path.append(os.getcwd())
+
+
+def _function(name: str) -> Callable[[Any], Any]:
+    """The function `module:function`, also from a module in the working folder."""
+    _look_here()
     module, _, function = name.partition(":")
     try:
         return getattr(import_module(module), function)

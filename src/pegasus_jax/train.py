@@ -1,10 +1,12 @@
 """The main job: an experiment trial by trial, for one seed or many at once, leaving folders that survive anything."""
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+import logging
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
 import jax
@@ -25,8 +27,6 @@ from pegasus_jax.record import RunError
 from pegasus_jax.trial import COLLECT, EVALUATE, trial_key
 from pegasus_jax.types import Experiment, Key, Learner, Params, RunState, Task, Trajectory
 
-EPISODES = 20  # evaluation episodes a trial; never data
-
 # What `improved` says of a trial that has not improved anything.
 UNKNOWN: dict[str, Any] = {
     "fit_loss": None,
@@ -36,6 +36,7 @@ UNKNOWN: dict[str, Any] = {
     "gradient_norm": None,
     "skipped_updates": 0,
 }
+UNMEASURED: dict[str, Any] = {"mean_cost": None, "success_rate": None}  # what `evaluate` says without episodes
 
 
 def train(config: Config, run: Path, *, resume: bool = False, command: str = "") -> RunState:
@@ -95,7 +96,8 @@ def train_seeds(
             boards.append(held.enter_context(SummaryWriter(str(run / "tensorboard"), purge_step=done + 1)))
         with display.running():
             for trial in range(done + 1, config.trials + 1):
-                states, rows = one_trial(states, trial, config, folders, experiment, program, display)
+                with on_plant(experiment.task, f"; resume={folders[0]} goes on from trial {trial}"):
+                    states, rows = one_trial(states, trial, config, folders, experiment, program, display)
                 whole = fetched(states)
                 for index, board in enumerate(boards):
                     record.write_trials(folders[index], [*record.trials(folders[index]), rows[index]])
@@ -127,7 +129,7 @@ def one_trial(
         states, found = improved(states, trial, runs, stacked, program, display)
     display.phase(trial, "evaluate", 0.9)
     keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(fetched(states.key))
-    evaluation = evaluate(keys, states.policy.params, task, program, EPISODES)
+    evaluation = evaluate(keys, states.policy.params, task, program, config.evaluation)
     seconds = program.seconds()
     rows = [
         {
@@ -195,8 +197,28 @@ def collected(
     return [episode for episode in episodes if episode is not None]
 
 
-def evaluate(keys: Key, params: Params, task: Task, program: Program, episodes: int) -> list[dict[str, float]]:
+@contextmanager
+def on_plant(task: Task, advice: str = "") -> Iterator[None]:
+    """What a plant on the host raises becomes one line, Ctrl-C itself; JAX would show a traceback of its insides."""
+    logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
+    try:
+        yield
+    except jax.errors.JaxRuntimeError as error:
+        trouble: list[BaseException] = getattr(task.plant, "trouble", [])
+        if not trouble:
+            raise
+        cause = trouble[-1]
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause from error
+        place = extract_tb(cause.__traceback__)[-1]
+        what = " ".join(f"{type(cause).__name__}: {cause} ({Path(place.filename).name}:{place.lineno})".split())
+        raise RunError(f"{task.name} failed in an episode, {what}{advice}") from error
+
+
+def evaluate(keys: Key, params: Params, task: Task, program: Program, episodes: int) -> list[dict[str, Any]]:
     """Mean cost a step and success rate of each seed [S], over fresh episodes, not data (docs/reference.md 10)."""
+    if not episodes:
+        return [UNMEASURED] * len(keys)
     costs = program.evaluate(jax.vmap(lambda key: jax.random.split(key, episodes))(keys), params)
     return [
         {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(success))}
@@ -280,7 +302,8 @@ def evaluate_run(run: Path, episodes: int, seed: int, shelf: Path | None = None)
     program = Program(experiment, 1, shelf=shelf)
     params = jax.tree.map(lambda leaf: leaf[None], state.policy.params)
     keys = jax.random.key(seed)[None]
-    (result,) = evaluate(keys, params, experiment.task, program, episodes)
+    with on_plant(experiment.task):
+        (result,) = evaluate(keys, params, experiment.task, program, episodes)
     return {"trial": int(state.trial), "episodes": episodes, **result, "fingerprint": checkpoint.fingerprint(state)}
 
 
@@ -293,17 +316,23 @@ def scalars(board: SummaryWriter, row: dict[str, Any]) -> None:
 
 def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
     """A trial in one line; over several seeds the means, and the median calibration."""
-    mean = {name: np.mean([row[name] for row in rows]) for name in ("mean_cost", "success_rate")}
+    measured = rows[0]["mean_cost"] is not None
+    names = ("mean_cost", "success_rate") if measured else ("episode_cost",)
+    mean = {name: np.mean([row[name] for row in rows]) for name in names}
     imagined = [row["objective_last"] for row in rows if row["objective_last"] is not None]
     first, skipped = rows[0], sum(row["skipped_updates"] for row in rows)
-    solved = sum(row["success_rate"] >= 0.9 for row in rows)
+    solved = sum(row["success_rate"] >= 0.9 for row in rows) if measured else 0
     errors = [row["calibration"] for row in rows if row["calibration"] is not None]
     return (
-        f"trial {first['trial']:>2}/{trials}  {first['plant_seconds']:6.1f} s of plant  cost {mean['mean_cost']:.3f}"
-        f"  success {mean['success_rate']:4.0%}"
+        f"trial {first['trial']:>2}/{trials}  {first['plant_seconds']:6.1f} s of plant"
+        + (
+            f"  cost {mean['mean_cost']:.3f}  success {mean['success_rate']:4.0%}"
+            if measured
+            else f"  cost of its episode {mean['episode_cost']:.3f}"
+        )
         + (f"  imagined {np.mean(imagined):.3f}" if imagined else "")
         + (f"  calibration {np.median(errors):.1f}" if errors else "")
-        + (f"  {solved} of {len(rows)} seeds solved" if len(rows) > 1 else "")
+        + (f"  {solved} of {len(rows)} seeds solved" if measured and len(rows) > 1 else "")
         + f"  ({sum(first['seconds'].values()):.0f} s, {first['seconds']['compile']:.0f} s of it compiling)"
         + (f"  {skipped} updates skipped" if skipped else "")
     )

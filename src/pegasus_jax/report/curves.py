@@ -21,6 +21,8 @@ def seeds_picture(runs: Sequence[Path], path: Path) -> Path:
     shared = min(map(len, rows))
     if not shared:
         raise RunError(f"{runs[0].parent}: not every run has a finished trial yet")
+    if any(row["mean_cost"] is None for run in rows for row in run[:shared]):
+        raise RunError(f"{runs[0].parent}: these runs were not evaluated (evaluation=0); pegasus-plot draws each alone")
     cost, success = ([[row[name] for row in run[:shared]] for run in rows] for name in ("mean_cost", "success_rate"))
     picture(
         {f"{len(runs)} seeds": (np.asarray(cost), np.asarray(success))}, [r["plant_seconds"] for r in rows[0]], path

@@ -36,10 +36,15 @@ def run_pictures(run: Path, task: Task) -> list[Path]:
 
 
 def learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Cost and success against seconds of plant time, raw: no smoothing, no best so far."""
+    """Cost and success against seconds of plant time, raw: no smoothing, no best so far.
+
+    Of a run that is not evaluated, the cost of each trial's own episode, by the policy of the trial before.
+    """
+    measured = any(row["mean_cost"] is not None for row in rows)
+    cost, label = ("mean_cost", "mean of evaluation episodes") if measured else ("episode_cost", "the trial's episode")
     seconds = [row["plant_seconds"] for row in rows]
     figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(7, 5.5), height_ratios=(2, 1))
-    top.plot(seconds, [row["mean_cost"] for row in rows], "o-", color=REAL, label="plant, mean of 20 episodes")
+    top.plot(seconds, [row[cost] for row in rows], "o-", color=REAL, label=f"plant, {label}")
     top.plot(seconds, [row["objective_last"] for row in rows], ".--", color=IMAGINED, label="imagined, held scenarios")
     top.plot(seconds, [row["objective_fresh"] for row in rows], ".:", color=IMAGINED, label="imagined, fresh scenarios")
     top.set(ylabel="mean cost a step", ylim=(0, 1.02))

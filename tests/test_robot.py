@@ -1,0 +1,212 @@
+"""A robot at the command line, as docs/extending.md says: it moves when an episode needs it, and is let go safely."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_envs.guest import facts, guest
+from pegasus_jax import record, settings, study
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import Config
+from pegasus_jax.deploy import controller
+from pegasus_jax.record import RunError
+from pegasus_jax.report.curves import seeds_picture
+from pegasus_jax.train import newest
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "extending.md").read_text(), re.DOTALL)
+ROBOT = next(block for block in EXAMPLES if "class Arm(" in block)
+# The documented arm, without its sleep, which writes down what is asked of it and breaks where it is told to.
+WATCHED = """
+import os, pathlib
+
+def note(what):
+    with open("asked.log", "a") as file:
+        print(what, file=file)
+
+class Watched(Arm):
+    count, dt = 0, 1e-3
+    def reset(self, **options):
+        note("reset")
+        return super().reset(**options)
+    def step(self, control):
+        note("step")
+        Watched.count += 1
+        if Watched.count == int(os.environ.get("BREAKS", 0)):
+            raise OSError("the motor driver does not answer")
+        if Watched.count == int(os.environ.get("HANGS", 0)):
+            time.sleep(60)
+        return super().step(control)
+    def close(self):
+        note("close")
+
+gymnasium.register("Watched-v0", Watched)
+"""
+WORDS = ["task=gym", "env=robot:Watched-v0", "cost=robot:cost", "angles=[0]", "start_mean=[3.14,0]", "evaluation=0"]
+TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
+PROGRAM = [sys.executable, "-P", "-c"]
+
+
+def started(name: str, *words: object, cwd: Path, **environment: int) -> subprocess.Popen[str]:
+    (cwd / "robot.py").write_text(ROBOT + WATCHED)
+    program = [*PROGRAM, f"from pegasus_jax.cli import {name}; {name}()", *map(str, words)]
+    told = {**os.environ, **{key: str(value) for key, value in environment.items()}}
+    return subprocess.Popen(program, cwd=cwd, env=told, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def call(name: str, *words: object, cwd: Path, **environment: int) -> tuple[int, str, str]:
+    process = started(name, *words, cwd=cwd, **environment)
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+def asked(cwd: Path) -> list[str]:
+    """What the robot has been asked for since the last look."""
+    path = cwd / "asked.log"
+    lines = path.read_text().split() if path.exists() else []
+    path.unlink(missing_ok=True)
+    return lines
+
+
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a run of two trials of five steps, and what it asked of the robot."""
+    home = tmp_path_factory.mktemp("robot")
+    code, _, err = call("train", *WORDS, *TINY, "horizon=5", "out=run", cwd=home)
+    assert code == 0, err
+    assert "cost of its episode" in err
+    return home
+
+
+def test_a_robot_moves_for_the_episodes_that_are_data_and_for_nothing_else(learned: Path) -> None:
+    """A reset and a horizon of steps a trial; going on opens it again, looking at the run does not."""
+    trial = ["reset", *["step"] * 5]
+    assert asked(learned) == [*trial, *trial, "close"]
+    rows = record.trials(learned / "run")
+    assert [(row["mean_cost"], row["success_rate"]) for row in rows] == [(None, None)] * 2
+    assert all(0 <= row["episode_cost"] <= 1 for row in rows)
+    code, out, err = call("plot", "run", cwd=learned)
+    assert (code, asked(learned)) == (0, []), err
+    assert "run/plots/learning.png" in out
+    code, _, err = call("train", "resume=run", "trials=3", cwd=learned)
+    assert (code, asked(learned)) == (0, [*trial, "close"]), err
+    code, out, err = call("evaluate", "run", "episodes=2", "json=true", cwd=learned)
+    assert (code, asked(learned)) == (0, [*trial, *trial, "close"]), err
+
+
+def test_what_it_learned_is_a_function(learned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(learned)
+    control = controller("run")
+    assert asked(learned) == []
+    _, experiment, state = newest(learned / "run")
+    for x in np.random.default_rng(0).normal(size=(5, 2)) * 3:
+        u = control(x)
+        np.testing.assert_allclose(u, experiment.policy.apply(state.policy.params, None, x), rtol=1e-5)
+        assert u.shape == (1,)
+        assert abs(u[0]) <= 2
+    for wrong in ([1.0], [1.0, np.nan]):
+        with pytest.raises(ValueError, match="2 finite numbers"):
+            control(wrong)
+    with pytest.raises(RunError, match="is not a run"):
+        controller("nowhere")
+
+
+def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None:
+    """In the second of two episodes of five steps. The first is kept, no step follows, and resuming does the rest."""
+    code, _, err = call("train", *WORDS, *TINY, "horizon=5", "out=run", cwd=tmp_path, BREAKS=8)
+    assert (code, "Traceback" in err) == (2, False), err
+    assert re.fullmatch(
+        r"pegasus: robot:Watched-v0 failed in an episode, OSError: the motor driver does not answer \(robot.py:\d+\);"
+        " resume=run goes on from trial 2",
+        err.splitlines()[-1],
+    )
+    assert asked(tmp_path) == ["reset", *["step"] * 5, "reset", *["step"] * 3, "close"]
+    first = record.load_episode(tmp_path / "run", 1)
+    assert (first is None, record.load_episode(tmp_path / "run", 2)) == (False, None)
+    code, _, err = call("train", "resume=run", cwd=tmp_path)
+    assert (code, asked(tmp_path)) == (0, ["reset", *["step"] * 5, "close"]), err
+    assert len(record.trials(tmp_path / "run")) == 2
+
+
+def test_ctrl_c_in_the_middle_of_an_episode(tmp_path: Path) -> None:
+    process = started("train", *WORDS, *TINY, "horizon=5", "out=run", cwd=tmp_path, HANGS=3)
+    log, deadline = tmp_path / "asked.log", time.monotonic() + 200
+    while not (log.exists() and log.read_text().count("step") == 3):
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.1)
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, "Traceback" in err) == (1, False), err
+    assert err.splitlines()[-1].startswith("stopped; every finished episode is kept")
+    assert asked(tmp_path)[-1] == "close"
+
+
+class Bounds(gymnasium.Env):
+    """An environment of two observations whose first control has no limit."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+    action_space = gymnasium.spaces.Box(np.array([-np.inf, -1.0]), np.array([np.inf, 1.0]), dtype=np.float64)
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        raise AssertionError("it was reset")
+
+
+class Sensors(gymnasium.Env):
+    """Three sensors, of which the second has lost its wire in the fourth step; it counts its steps."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
+        return np.zeros(3), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        Sensors.steps += 1
+        return np.array([0.0, np.nan if Sensors.steps == 4 else 0.0, 0.0]), 0.0, False, False, {}
+
+
+def test_no_control_follows_from_an_observation_that_is_not_finite() -> None:
+    gymnasium.register("Sensors-v0", Sensors)
+    plant = guest("Sensors-v0", facts("Sensors-v0", start_mean=[0.0]))
+    step = lambda x, _: (plant.step(x, jnp.zeros(1)), None)  # noqa: E731
+    with pytest.raises(jax.errors.JaxRuntimeError):
+        jax.block_until_ready(jax.jit(lambda key: jax.lax.scan(step, plant.reset(key), None, 9)[0])(jax.random.key(0)))
+    assert Sensors.steps == 4
+    assert [str(error) for error in plant.trouble] == ["entry 1 of its observation is nan"]
+
+
+def test_facts_that_are_given_are_not_asked_for() -> None:
+    gymnasium.register("Bounds-v0", Bounds)
+    known = facts("Bounds-v0", control_low=[-3, -0.5], control_high=[2, 1], dt=0.1, start_mean=[1, 2], start_std=[0.1])
+    np.testing.assert_array_equal(known.control_low, [-3, -0.5])
+    np.testing.assert_array_equal(known.control_high, [2, 1])
+    np.testing.assert_array_equal(known.start_std, [0.1, 0.1])
+    assert (known.dt, known.horizon) == (0.1, 100)
+    with pytest.raises(ValueError, match="give control_low= and control_high="):
+        facts("Bounds-v0", start_mean=[0])
+    with pytest.raises(ValueError, match="controls from -2 to 2 are not among its own, from -1 to 1"):
+        facts("Bounds-v0", control_low=[-2], control_high=[2], start_mean=[0])
+    with pytest.raises(ValueError, match="start_mean has 3 entries; expected 2"):
+        facts("Bounds-v0", control_low=[-1], control_high=[1], start_mean=[0, 0, 0])
+
+
+def test_runs_that_were_not_evaluated_have_no_curves_to_compare(learned: Path) -> None:
+    with pytest.raises(RunError, match="evaluation=0"):
+        seeds_picture([learned / "run"], learned / "learning.png")
+    with pytest.raises(SettingError, match="evaluation=0"):
+        study.study(Config(evaluation=0), [0])
+    assert settings.load(learned / "run" / "config.yaml").start_mean == (3.14, 0.0)
