@@ -139,9 +139,9 @@ def suite(words: Words, repeats: int, quick: bool) -> dict[str, Row]:
             work = workload({**SIZES[name], "search.match": match, **words})
             rows[f"search step, {name}{suffix}"] = search_step(work, repeats)
     if not quick:  # for its memory
-        work = workload({**SIZES["swimmer, 6 legs"], "search.particles": "1000", **words})
+        work = workload({**SIZES["six-legged swimmer"], "search.particles": "1000", **words})
         search = partial(work.experiment.search, steps=1)
-        rows["search step, swimmer, 6 legs, K=1000"] = measure(search, work.state, jnp.int32(1), repeats=1)
+        rows["search step, six-legged swimmer with K=1000"] = measure(search, work.state, jnp.int32(1), repeats=1)
     cartpole = {**SIZES["cart-pole"], **words}
     rows |= trial_parts(settings.parse(cartpole), repeats)
     return rows if quick else rows | growth(cartpole, repeats)

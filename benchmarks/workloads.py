@@ -32,14 +32,14 @@ SIZES = {
         **ALIKE,
     },
     "double cart-pole": {"task": "double_cartpole", "model": "log_normal", "search.particles": "100"},
-    "swimmer, 6 legs": {
+    "six-legged swimmer": {
         "task": "swimmer_depth_change",
         "model": "log_normal",
         "legs": "6",
         "search.particles": "100",
         **ALIKE,
     },
-    "cart-pole, K=1000": {
+    "cart-pole with K=1000": {
         "task": "cartpole",
         "model": "log_normal",
         "policy": "dropout_mlp",

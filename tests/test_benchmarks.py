@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import compare, scaling, searches, timing
 from benchmarks.workloads import SIZES, flop, products, workload
-from pegasus_jax import record
+from pegasus_jax import record, settings
 from probes import unchecked
 
 TINY = {
@@ -86,6 +86,20 @@ def test_a_workload_is_well_conditioned(work):
     assert 0.05 < value < 0.95
     assert np.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(gradient)])).all()
     assert set(SIZES) >= {"cart-pole", "double cart-pole"}
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_every_size_can_be_asked_for(name):
+    """By `sizes=A,B`, and with the tasks' settings as they now are."""
+    assert "," not in name
+    assert settings.parse(SIZES[name]).search.refine == 0
+
+
+def test_two_processors_of_one_name_are_told_apart(monkeypatch):
+    for family, said in (("25", "AMD EPYC, family 25, model 17"), ("26", "AMD EPYC, family 26, model 17")):
+        known = {"flags": "sse", "model": "17", "cpu family": family, "model name": "AMD EPYC"}
+        monkeypatch.setattr(record, "processor", lambda known=known: known)
+        assert record.about("")["processor"] == said
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ import sys
 import tempfile
 import zipfile
 from collections.abc import Callable
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import IO, Any
@@ -182,12 +183,17 @@ def about(command: str) -> dict[str, Any]:
         "command": command,
         "python": sys.version.split()[0],
         "platform": platform.platform(),
-        "processor": processor()["model name"],
+        "processor": ", ".join(f"{label}{processor()[name]}" for name, label in NAMED.items() if name in processor()),
         "devices": [str(device) for device in jax.devices()],
         "versions": versions,
     }
 
 
+# What tells processors apart: a virtual machine may call two generations by one name.
+NAMED = {"model name": "", "cpu family": "family ", "model": "model "}
+
+
+@cache
 def processor() -> dict[str, str]:
     """What the system says of its first processor, at least its "model name"; on Linux also what it can execute."""
     known = {"model name": f"{platform.machine()} {platform.processor()}"}
