@@ -6,6 +6,8 @@ It may be a robot, so it is opened once a process, never reset without need, and
 import atexit
 from collections.abc import Callable, Sequence
 from functools import cache, partial
+from pathlib import Path
+from traceback import extract_tb
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -41,7 +43,7 @@ class Guest(NamedTuple):
     """(x [D] of the step before, control [U]) -> x [D]; the environment knows its state itself, and rests when ended"""
     observe: Callable[[Array], Array]
     trouble: list[BaseException]
-    """what `reset` and `step` have raised on the host, which JAX reports as an error of its own"""
+    """what `reset` and `step` have raised, with a note of where; JAX reports an error of its own"""
     control_low: np.ndarray
     control_high: np.ndarray
     dt: float
@@ -140,6 +142,9 @@ def guest(name: str, known: Facts) -> Guest:
         try:
             return function(*arguments)
         except BaseException as error:
+            theirs = [frame for frame in extract_tb(error.__traceback__) if frame.filename != __file__]
+            for frame in theirs[-1:]:
+                error.add_note(f"{Path(frame.filename).name}:{frame.lineno}")
             trouble.append(error)
             raise
 

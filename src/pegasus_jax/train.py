@@ -6,7 +6,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from traceback import extract_tb
 from typing import Any
 
 import jax
@@ -201,17 +200,18 @@ def collected(
 def on_plant(task: Task, advice: str = "") -> Iterator[None]:
     """What a plant on the host raises becomes one line, Ctrl-C itself; JAX would show a traceback of its insides."""
     logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
+    trouble: list[BaseException] = getattr(task.plant, "trouble", [])
+    trouble.clear()
     try:
         yield
     except jax.errors.JaxRuntimeError as error:
-        trouble: list[BaseException] = getattr(task.plant, "trouble", [])
         if not trouble:
             raise
         cause = trouble[-1]
         if isinstance(cause, KeyboardInterrupt):
             raise cause from error
-        place = extract_tb(cause.__traceback__)[-1]
-        what = " ".join(f"{type(cause).__name__}: {cause} ({Path(place.filename).name}:{place.lineno})".split())
+        where = "".join(f" ({note})" for note in getattr(cause, "__notes__", []))
+        what = " ".join(f"{type(cause).__name__}: {cause}{where}".split())
         raise RunError(f"{task.name} failed in an episode, {what}{advice}") from error
 
 
