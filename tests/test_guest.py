@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from pegasus_envs.guest import facts, guest
+from pegasus_envs.guest import guest
 from pegasus_jax import program, record, settings
 from pegasus_jax.build import build, compose
 from pegasus_jax.config import Config, Search
@@ -56,7 +56,7 @@ def test_an_environment_not_written_for_us(env: str, cost: str, states: int, lim
 
 def test_a_guest_obeys_gymnasium() -> None:
     """Reset by key is reset by a seed, and steps come in order, in compiled code."""
-    plant = guest("Pendulum-v1", facts("Pendulum-v1"))
+    plant = guest("Pendulum-v1", 3)
     controls = np.linspace(-2, 2, 12, dtype=np.float32)[:, None]
 
     @jax.jit
@@ -94,7 +94,7 @@ class Fragile(gymnasium.Env):
 
 def test_an_environment_rests_once_it_has_ended() -> None:
     gymnasium.register("Fragile-v0", Fragile)
-    plant = guest("Fragile-v0", facts("Fragile-v0"))
+    plant = guest("Fragile-v0", 1)
 
     @jax.jit
     def run(key: jax.Array) -> jax.Array:

@@ -181,7 +181,7 @@ class Sensors(gymnasium.Env):
 
 def test_no_control_follows_from_an_observation_that_is_not_finite() -> None:
     gymnasium.register("Sensors-v0", Sensors)
-    plant = guest("Sensors-v0", facts("Sensors-v0", start_mean=[0.0]))
+    plant = guest("Sensors-v0", 3)
     step = lambda x, _: (plant.step(x, jnp.zeros(1)), None)  # noqa: E731
     with pytest.raises(jax.errors.JaxRuntimeError):
         jax.block_until_ready(jax.jit(lambda key: jax.lax.scan(step, plant.reset(key), None, 9)[0])(jax.random.key(0)))

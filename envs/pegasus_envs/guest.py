@@ -44,12 +44,6 @@ class Guest(NamedTuple):
     observe: Callable[[Array], Array]
     trouble: list[BaseException]
     """what `reset` and `step` have raised, with a note of where; JAX reports an error of its own"""
-    control_low: np.ndarray
-    control_high: np.ndarray
-    dt: float
-    horizon: int
-    start_mean: np.ndarray
-    start_std: np.ndarray
 
 
 @cache
@@ -107,13 +101,13 @@ def facts(
     return Facts(low, high, dt or own_period, horizon or own_limit or 100, mean, std)
 
 
-def guest(name: str, known: Facts) -> Guest:
-    """The environment `name`, opened when its first episode begins.
+def guest(name: str, states: int) -> Guest:
+    """The environment `name` of so many observations, opened when its first episode begins.
 
-    Episodes have one length: after an early end, x stays as it is. An observation that is not finite, or not of the
-    shape of `known.start_mean`, is refused at once: no control follows from it, and no data.
+    Episodes have one length: after an early end, x stays as it is. An observation that is not finite, or not of that
+    length, is refused at once: no control follows from it, and no data.
     """
-    shape = jax.ShapeDtypeStruct(known.start_mean.shape, np.float32)
+    shape = jax.ShapeDtypeStruct((states,), np.float32)
     trouble: list[BaseException] = []
     ended = False
 
@@ -154,5 +148,4 @@ def guest(name: str, known: Facts) -> Guest:
         step=lambda x, control: io_callback(partial(told, step), shape, x, control),
         observe=lambda x: x,
         trouble=trouble,
-        **known._asdict(),
     )

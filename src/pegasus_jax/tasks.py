@@ -229,11 +229,10 @@ def of_guest(config: Config) -> Task:
     if any(value in (None, ()) for value in known.values()):
         return of_guest(pinned(config))
     known |= {name: np.array(value, float) for name, value in known.items() if isinstance(value, tuple)}
-    name = config.env or ""
-    plant = guest(name, Facts(**known))
-    states = tuple(f"x{i}" for i in range(len(plant.start_mean)))
-    controls = tuple(f"u{i}" for i in range(len(plant.control_low)))
-    task = _of_users(config, name, plant, plant.horizon, states, controls)
+    name, about = config.env or "", Facts(**known)
+    states = tuple(f"x{i}" for i in range(len(about.start_mean)))
+    controls = tuple(f"u{i}" for i in range(len(about.control_low)))
+    task = _of_users(config, name, guest(name, len(states)), about, about.horizon, states, controls)
     return task._replace(rates=_entries("rates", config.rates, name, len(states)))
 
 
@@ -260,7 +259,7 @@ def of_mjcf(config: Config) -> Task:
     except ValueError as error:
         raise SettingError(f"mjcf={config.mjcf}: {error}") from error
     name = Path(config.mjcf or "").stem
-    task = _of_users(config, name, plant, config.horizon or 0, plant.state_names, plant.control_names)
+    task = _of_users(config, name, plant, plant, config.horizon or 0, plant.state_names, plant.control_names)
     return task._replace(rates=plant.rates)
 
 
@@ -272,21 +271,21 @@ def _model(config: Config) -> Any:
 
 
 def _of_users(
-    config: Config, name: str, plant: Any, horizon: int, states: tuple[str, ...], controls: tuple[str, ...]
+    config: Config, name: str, plant: Any, about: Any, horizon: int, states: tuple[str, ...], controls: tuple[str, ...]
 ) -> Task:
-    """The task that a user's plant poses with the cost and the angles that the config names."""
+    """The task that a user's plant, about which `about` is known, poses with the config's cost and angles."""
     return Task(
         name=name,
         plant=plant,
         cost=_function(config.cost or ""),
         angles=_entries("angles", config.angles, name, len(states)),
-        start_mean=plant.start_mean,
-        start_std=plant.start_std,
+        start_mean=about.start_mean,
+        start_std=about.start_std,
         sensor_std=np.zeros(len(states)),
-        control_low=plant.control_low,
-        control_high=plant.control_high,
+        control_low=about.control_low,
+        control_high=about.control_high,
         horizon=horizon,
-        dt=plant.dt,
+        dt=about.dt,
         state_names=states,
         control_names=controls,
     )
