@@ -51,6 +51,7 @@ class Watched(Arm):
         return super().step(control)
     def close(self):
         note("close")
+        super().close()
 
 gymnasium.register("Watched-v0", Watched)
 """
@@ -138,6 +139,18 @@ def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None
     code, _, err = call("train", "resume=run", cwd=tmp_path)
     assert (code, asked(tmp_path)) == (0, ["reset", *["step"] * 5, "close"]), err
     assert len(record.trials(tmp_path / "run")) == 2
+
+
+@pytest.mark.parametrize(
+    ("wrong", "says", "asks"),
+    [("cost=robot:coast", "cost=robot:coast cannot be imported", []), ("angles=[2]", "choose from 0 to 1", ["close"])],
+)
+def test_a_mistaken_setting_moves_no_robot(wrong: str, says: str, asks: list[str], tmp_path: Path) -> None:
+    """One that is opened to be asked what it is like is closed again, in peace, though it was never reset."""
+    code, _, err = call("train", *WORDS, *TINY, wrong, "horizon=5", "out=run", cwd=tmp_path)
+    assert (code, err.count("\n")) == (2, 1), err
+    assert says in err
+    assert asked(tmp_path) == asks
 
 
 def test_ctrl_c_in_the_middle_of_an_episode(tmp_path: Path) -> None:

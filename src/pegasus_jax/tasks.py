@@ -237,10 +237,10 @@ def of_guest(config: Config) -> Task:
 
 
 def _complete(config: Config) -> None:
-    """Raises SettingError unless both an environment and a cost are named."""
+    """Raises SettingError unless an environment is named, and a cost that there is: no robot is opened in vain."""
     if config.env is None or config.cost is None:
         raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
-    _look_here()
+    _function(config.cost)  # from now on modules in the working folder are found, the environment's too
 
 
 def of_mjcf(config: Config) -> Task:
@@ -301,15 +301,10 @@ def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> 
     return entries
 
 
-def _look_here() -> None:
-    """Let modules in the working folder be found, as by `python -m`."""
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
-
-
 def _function(name: str) -> Callable[[Any], Any]:
     """The function `module:function`, also from a module in the working folder."""
-    _look_here()
+    if os.getcwd() not in sys.path:
+        sys.path.append(os.getcwd())
     module, _, function = name.partition(":")
     try:
         return getattr(import_module(module), function)
