@@ -215,7 +215,7 @@ def collected(
     episodes = [record.load_episode(run, trial) for run in runs]
     if any(ran is None for ran in episodes):
         keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(fetched(states.key))
-        random, rows_so_far = trial <= config.explore.trials, np.asarray(fetched(states.data.size))
+        random = trial <= config.explore.trials
         fresh = program.collect(keys, states.policy.params, random)
         policies = np.asarray(fetched(states.policy_trial))
         for index, run in enumerate(runs):
