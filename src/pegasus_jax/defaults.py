@@ -62,8 +62,7 @@ _LEGS: dict[int, dict[str, Any]] = {
 # docs/decisions/0006, 0008, 0009 and, for the swimmer, 0017.
 BEST: dict[str, tuple[str, dict[str, Any]]] = {
     **{
-        f"swimmer_{manoeuvre}": ("log_normal", {"model.members": 5, "model.kl_weight": 1.0})
-        for manoeuvre in MANOEUVRES
+        f"swimmer_{manoeuvre}": ("log_normal", {"model.members": 5, "model.kl_weight": 1.0}) for manoeuvre in MANOEUVRES
     },
     "cartpole": ("lagrangian", {}),
     "double_cartpole": (

@@ -54,6 +54,7 @@ TASKS: dict[str, Callable[[Any], Plant]] = {
     **{f"swimmer_{manoeuvre}": partial(swimmer, manoeuvre) for manoeuvre in MANOEUVRES},
 }
 
+
 def make(name: str, legs: int = 2) -> Task:
     """The task of that name; only the swimmer has legs. Raises SettingError for an unknown one."""
     if name not in TASKS:
