@@ -18,8 +18,8 @@ pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that 
                                                 fit.* or search.* settings
 
   task=cartpole         what to learn: {tasks}
-  model=log_normal      dynamics model: {models};
-                        with task=cartpole it is lagrangian unless you say otherwise
+  model=log_normal      dynamics model: {models}
+                        (default: the one that learns the task best, of cartpole and double_cartpole lagrangian)
   policy=mlp            controller: {policies}
   algorithm=pegasus     how to search: {algorithms}
   out=runs/...          the run's folder (default: runs/TASK-seedN)
