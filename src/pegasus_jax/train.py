@@ -77,7 +77,7 @@ def train_seeds(
         program.on_compile = display.compiling
         states = together(folders, replace(before, seed=0), display) if resume else None
         done = 0 if states is None else int(states.trial[0])
-        if done < config.trials:
+        if max(done + 1, config.explore.trials) <= config.trials:  # else no policy is searched
             program.prepare("search")
         keys = jnp.stack([jax.random.key(seed) for seed in seeds])
         if states is None:
