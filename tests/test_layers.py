@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
-    0: "types checks config variants defaults",
+    0: "types checks config variants defaults interrupt",
     1: "angles mesh quantile dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout"
     " episode calibration",
     2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco",

@@ -32,7 +32,7 @@ class Watched:
         )
         self.init, self.collect = jax.jit(self.exp.init), jax.jit(self.exp.collect)
         self.absorb, self.fit = jax.jit(self.exp.absorb), jax.jit(self.exp.fit)
-        self.search = jax.jit(self.exp.search)
+        self.search, self.succeed = jax.jit(self.exp.search), jax.jit(self.exp.succeed)
         self.episodes = unchecked(jax.jit(jax.vmap(self.exp.episode, (0, None, None))))
 
     def traces(self):
@@ -52,7 +52,9 @@ def loop(watched, seed):
         trajectory = watched.collect(state)
         state = watched.absorb(state, trajectory)
         state, fitted = watched.fit(state)
+        incumbent = state.policy.params
         state, searched = watched.search(state)
+        state, _ = watched.succeed(state, incumbent)
         keys = jax.random.split(trial_key(state.key, state.trial, EVALUATE), EPISODES)
         evaluation = watched.episodes(keys, state.policy.params, False)
         states.append(state)
@@ -121,7 +123,9 @@ def test_a_trial_is_a_function_of_state_alone(watched, looped):
     trajectory = watched.collect(states[2])
     assert same(trajectory, infos[2].trajectory)
     state, fitted = watched.fit(watched.absorb(states[2], trajectory))
+    incumbent = state.policy.params
     state, searched = watched.search(state)
+    state, _ = watched.succeed(state, incumbent)
     assert same(state, states[3])
     assert same((fitted, searched), infos[2][2:])
 

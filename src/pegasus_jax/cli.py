@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pegasus_jax import interrupt
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config, Search
 
@@ -23,6 +24,7 @@ pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that 
   policy=mlp            controller: {policies}
   algorithm=pegasus     how to search: {algorithms}
   out=runs/...          the run's folder (default: runs/TASK-seedN)
+  final=true            run the last policy for one more episode, which is data if the run goes on
   seeds=1               so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN
   mesh=SEEDSxPARTICLES  the devices that share seeds and particles (default: as many GPUs, or cores of a CPU, as share
                         the seeds evenly)
@@ -132,7 +134,17 @@ def figures() -> None:
     main(_figures, FIGURES, stopped="finished variants are kept, the same command goes on")
 
 
-OPTIONS = ("out", "resume", "seeds", "mesh", "distributed", "coordinator", "processes", "process")  # of pegasus-train
+OPTIONS = (
+    "out",
+    "resume",
+    "final",
+    "seeds",
+    "mesh",
+    "distributed",
+    "coordinator",
+    "processes",
+    "process",
+)  # of pegasus-train
 
 
 def _train(words: Sequence[str]) -> None:
@@ -141,7 +153,9 @@ def _train(words: Sequence[str]) -> None:
     options, rest = settings.split(words, OPTIONS)
     command = shlex.join(["pegasus-train", *words])
     if "resume" in options:
-        if wrong := sorted(key for key in {*rest, *options} - {"resume", *OPTIONS[3:]} if not _changeable(key)):
+        if wrong := sorted(
+            key for key in {*rest, *options} - {"resume", "final", *OPTIONS[4:]} if not _changeable(key)
+        ):
             raise SettingError(
                 f"{wrong[0]} cannot be changed by resume=; only trials=, evaluation=, fit.* and search.* can"
             )
@@ -158,11 +172,14 @@ def _train(words: Sequence[str]) -> None:
         runs = {config.seed: home} if len(seeds) == 1 else {seed: home / f"seed{seed}" for seed in seeds}
     if len(runs) > 1 and config.task == defaults.GYM:
         raise SettingError(f"seeds={len(runs)} is too many for task=gym, whose environment is one object; seeds=1")
+    if options.get("final", "false") not in ("true", "false"):
+        raise SettingError(f"final={options['final']} is neither true nor false")
     done = len(record.trials(first)) if "resume" in options else None
     print(progress.announcement(config, home, len(runs), done), flush=True)
     _join(options)
     from pegasus_jax.program import leads, share_processors
 
+    # Before any of the user's code, which may use JAX as soon as it is imported.
     if not {"mesh", "distributed", "coordinator"} & {*options}:
         search = config.search
         share_processors(len(runs), search.particles * search.starts if isinstance(search, Search) else None)
@@ -183,8 +200,9 @@ def _train(words: Sequence[str]) -> None:
             record.create(run)
     from pegasus_jax.train import train_seeds
 
+    final = options.get("final") == "true"
     try:
-        train_seeds(config, runs, resume="resume" in options, command=command, mesh=over, shelf=kept)
+        train_seeds(config, runs, resume="resume" in options, command=command, final=final, mesh=over, shelf=kept)
     except KeyboardInterrupt:
         raise KeyboardInterrupt(progress.stopped(home)) from None
     if leads():
@@ -373,23 +391,51 @@ def main(
     text: str,
     stopped: str = "every finished episode is kept, resume=RUN goes on",
 ) -> None:
-    """Run a command: 0 done, 1 stopped by its user, 2 a setting or a run's folder that cannot be, in one line."""
+    """Run a command: 0 done, 2 a setting or a run's folder that cannot be, in one line, 130 after Ctrl-C.
+
+    Whatever ends it, a robot is let go first, and no thread that still compiles is waited for.
+    """
     words = sys.argv[1:]
+    interrupt.listen()
+    interrupt.before_end(_let_robots_go)
+    try:
+        code = _code(command, words, text)
+    except KeyboardInterrupt as stop:
+        interrupt.clean_up()
+        told = [word for word in stop.args if isinstance(word, str)]
+        print(told[0] if told else f"stopped; {stopped}", file=sys.stderr)
+        code = interrupt.status()
+    except BaseException:
+        interrupt.clean_up()
+        raise
+    interrupt.clean_up()
+    interrupt.end(code)
+
+
+def _let_robots_go() -> None:
+    """Close every environment that is open."""
+    if "pegasus_jax.tasks" in sys.modules:  # else none can be
+        from pegasus_jax.tasks import close_environments
+
+        close_environments()
+
+
+def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: str) -> int:
+    """The exit status of a command that nobody stopped."""
     from pegasus_jax.record import RunError
 
     try:
-        words += _always() if words and command in (_train, _figures) else []
+        words = [*words, *(_always() if words and command in (_train, _figures) else ())]
         if not words or HELP & {*words}:
             print(_help(text, words), end="")
-            sys.exit(0 if words else 2)
+            return 0 if words else 2
         _remember_compilations()
         command(words)
     except (SettingError, RunError) as error:
+        interrupt.clean_up()
         print(f"pegasus: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt as stop:
-        print(stop.args[0] if stop.args else f"stopped; {stopped}", file=sys.stderr)
-        sys.exit(1)
+        return 2
+    return 0
 
 
 def _always() -> list[str]:

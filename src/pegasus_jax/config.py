@@ -29,6 +29,7 @@ SENSORS = ("predicted", "known")
 EXECUTIONS = ("sampled", "mean")
 LEGS = (2, 6)
 PRECISIONS = ("single", "double")
+SUCCESSORS = ("always", "better")
 
 
 @dataclass(frozen=True)
@@ -349,6 +350,13 @@ class Config:
     dt: float | None = setting(
         None, "of task=gym|mjcf: control period [s]; null: a gym's own. A whole number of an mjcf's time steps"
     )
+    env_args: tuple[str, ...] = setting(
+        (), "of task=gym: the environment's own arguments, each as env_args.port=/dev/ttyACM0"
+    )
+    stop: str | None = setting(
+        None, "of task=gym|mjcf: of one observation, the probability that an episode ends there; module:function"
+    )
+    stop_cost: float = setting(1.0, "of each control period that an early end leaves out")
     observe: tuple[str, ...] = setting((), "of task=mjcf: as [qpos.0,qvel.1]; []: all positions, then all velocities")
     control_low: tuple[float, ...] = setting(
         (), "of task=gym|mjcf: least controls; []: the action space's, the file's ctrlrange"
@@ -365,6 +373,9 @@ class Config:
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
     evaluation: int = setting(20, "episodes after each trial that only measure the policy; 0: none, as for a robot")
+    successor: str = setting(
+        "always", "which policy runs next: always the new one, or the better one as expected under the new model"
+    )
     precision: str = setting("single", "of all numbers: single (32 bits) or double (64)")
     model: Model = BNN()
     policy: MLP | RBF | Linear = MLP()
@@ -375,7 +386,18 @@ class Config:
     def __post_init__(self) -> None:
         checks.choice("legs", self.legs, LEGS)
         checks.choice("precision", self.precision, PRECISIONS)
-        for name in ("angles", "rates", "observe", "control_low", "control_high", "start_mean", "start_std"):
+        checks.choice("successor", self.successor, SUCCESSORS)
+        checks.within("stop_cost", self.stop_cost, 0)
+        for name in (
+            "env_args",
+            "angles",
+            "rates",
+            "observe",
+            "control_low",
+            "control_high",
+            "start_mean",
+            "start_std",
+        ):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for deviation in self.start_std:
             checks.within("start_std", deviation, 0)

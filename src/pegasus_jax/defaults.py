@@ -18,6 +18,8 @@ _FINDING: dict[str, Any] = {"search.balanced": True, "search.refine": 0.5}
 
 # A cost of one's own has no width to widen; its expectation is a mean over nodes: docs/decisions/0018.
 _OWN_COST: dict[str, Any] = {"search.widen": 1.0, **_FINDING}
+# A robot runs a new policy only where it is expected to be better than the one before.
+_GYM: dict[str, Any] = {**_OWN_COST, "successor": "better"}
 
 _CARTPOLE: dict[str, Any] = {
     "model.substeps": 1,  # no pole turns fast enough for two to matter
@@ -92,7 +94,9 @@ BEST: dict[str, tuple[str, dict[str, Any]]] = {
 
 def defaults(name: str, legs: int = 2) -> dict[str, Any]:
     """What a task changes in the defaults of config.py, by dotted name."""
-    if name in (GYM, MJCF):
+    if name == GYM:
+        return _GYM
+    if name == MJCF:
         return _OWN_COST
     if name == "cartpole":
         return _CARTPOLE

@@ -3,11 +3,12 @@
 import os
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
+from threading import Thread
 from typing import Any
 
 import jax
@@ -18,8 +19,9 @@ from jax.sharding import Mesh, NamedSharding
 
 from pegasus_jax import mesh
 from pegasus_jax.compiled import program
+from pegasus_jax.episode import trimmed
 from pegasus_jax.record import processors
-from pegasus_jax.types import Experiment
+from pegasus_jax.types import Episode, Experiment, Params, Trajectory
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 
@@ -58,13 +60,13 @@ class Jitted:
         """Wait until it is compiled for arguments of these shapes."""
         if self.compiled is None:
             began = time.monotonic()
-            self.compiled = self.coming.result() if self.coming else self.compile(*arguments)
+            self.compiled = (self.coming or begun(self.compile, *arguments)).result()
             self.seconds = time.monotonic() - began
 
     def __call__(self, *arguments: Any) -> Any:
         self.ready(*arguments)
         compiled: Any = self.compiled
-        return jax.block_until_ready(compiled(*arguments))
+        return begun(lambda: jax.block_until_ready(compiled(*arguments))).result()
 
     def compile(self, *arguments: Any) -> Any:
         """The function compiled for arguments of these shapes, now or by an earlier command."""
@@ -90,10 +92,10 @@ class Program:
         shelf: Path | None = None,
     ) -> None:
         self.mesh, self.seeds = over, seeds
-        # Evaluation episodes. A GPU takes as long for one as for twenty; a processor does not, and would have one
-        # more program to compile. Of a plant on the host, whose trouble is kept there, there is one.
-        able = jax.default_backend() != "cpu" and not hasattr(experiment.task.plant, "trouble")
-        self.side_by_side = able if side_by_side is None else side_by_side
+        self.drive, self.horizon = experiment.drive, experiment.task.horizon
+        # Evaluation episodes. A GPU takes as long for one as for twenty; a CPU does not, and would have one more
+        # program to compile.
+        self.side_by_side = jax.default_backend() != "cpu" if side_by_side is None else side_by_side
         self.chunk = chunk(search_steps)
         self.chunks = search_steps // self.chunk
         functions = {
@@ -103,7 +105,7 @@ class Program:
             "absorb": (experiment.absorb, (0, 0)),
             "fit": (experiment.fit, (0,)),
             "search": (partial(experiment.search, steps=self.chunk), (0, None)),
-            "imagine": (experiment.imagine, (0,)),
+            "succeed": (experiment.succeed, (0, 0)),
             "calibrate": (experiment.calibrate, (0, 0)),
         }
         self.axes = {name: axes for name, (_, axes) in functions.items()}
@@ -132,9 +134,7 @@ class Program:
         arguments: tuple[Any, ...] = (states, *rest)
         if self.mesh is not None:
             arguments = self.laid_out(part, arguments, described)
-        worker = ThreadPoolExecutor(1)
-        jitted.coming = worker.submit(jitted.compile, *arguments)
-        worker.shutdown(wait=False)
+        jitted.coming = begun(jitted.compile, *arguments)
 
     def laid_out(self, part: str, arguments: tuple, lay: Callable[[Any, NamedSharding], Any]) -> tuple:
         """A part's arguments on the mesh: those that all seeds share whole on every device, the others by seeds."""
@@ -157,8 +157,22 @@ class Program:
         self.spent["compile"] = self.spent.get("compile", 0.0) + compiling
         return result
 
+    def collect(self, keys: Any, params: Params, exploring: bool, purpose: str = "collect") -> list[Episode]:
+        """An episode of each seed's policy [S, ...], or of random controls."""
+        if self.drive is None:
+            ran: Trajectory = fetched(self("episode", keys, params, jnp.asarray(exploring), purpose=purpose))
+            alone = [trimmed(jax.tree.map(lambda leaf: leaf[i], ran)) for i in range(self.seeds)]  # noqa: B023
+            return [Episode(one, "horizon" if len(one.u) == self.horizon else "terminated") for one in alone]
+        began = time.monotonic()
+        found = [
+            self.drive(keys[i], jax.tree.map(lambda leaf: leaf[i], params), exploring)  # noqa: B023
+            for i in range(self.seeds)
+        ]
+        self.spent[purpose] = self.spent.get(purpose, 0.0) + time.monotonic() - began
+        return found
+
     def evaluate(self, keys: Any, params: Any) -> np.ndarray:
-        """Costs [S, E, H] of episodes of the policies, one for each key [S, E]."""
+        """Costs [S, E, H] of episodes on a plant in JAX of the policies, one for each key [S, E]."""
         follow = jnp.asarray(False)  # the policy, not random controls
         if self.side_by_side:
             return np.asarray(fetched(self("evaluate", keys, params, follow).cost))
@@ -169,6 +183,23 @@ class Program:
         """Seconds spent in each part since the last call."""
         spent, self.spent = self.spent, {}
         return {name: round(spent.get(name, 0.0), 3) for name in NAMES}
+
+
+def begun(function: Callable[..., Any], *arguments: Any) -> Future:
+    """The function's result to come. Another thread computes it, so that a signal always finds this one awake.
+
+    A thread that does not keep the process alive: who is asked to stop does not wait for the compiler.
+    """
+    coming: Future = Future()
+
+    def work() -> None:
+        try:
+            coming.set_result(function(*arguments))
+        except BaseException as error:
+            coming.set_exception(error)
+
+    Thread(target=work, daemon=True).start()
+    return coming
 
 
 def share_processors(seeds: int, particles: int | None = None) -> None:

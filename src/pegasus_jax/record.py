@@ -31,7 +31,7 @@ from filelock import FileLock, Timeout
 from pegasus_jax.checks import SettingError
 
 if TYPE_CHECKING:  # JAX is imported where it is needed: a command names its folder before it waits for that
-    from pegasus_jax.types import Rollout, Task, Trajectory
+    from pegasus_jax.types import Episode, Rollout, Task, Trajectory
 
 
 class RunError(Exception):
@@ -117,22 +117,23 @@ def episode_path(run: Path, trial: int) -> Path:
     return run / "episodes" / f"{trial:04d}.npz"
 
 
-def save_episode(run: Path, trial: int, episode: Trajectory, task: Task) -> None:
+def save_episode(run: Path, trial: int, trajectory: Trajectory, task: Task, *, policy: int, ended: str) -> None:
     """Make an episode durable, with what a reader needs to understand it without us."""
-    arrays = {name: np.asarray(value) for name, value in episode._asdict().items()}
-    facts = dict(state_names=task.state_names, control_names=task.control_names, dt=task.dt, task=task.name)
-    write_whole(episode_path(run, trial), lambda file: np.savez(file, **arrays, **facts, trial=trial))  # type: ignore[arg-type]
+    arrays = {name: np.asarray(getattr(trajectory, name)) for name in ("x", "u", "cost")}
+    about = dict(state_names=task.state_names, control_names=task.control_names, dt=task.dt, task=task.name)
+    about |= dict(trial=trial, horizon=task.horizon, policy=policy, ended=ended)
+    write_whole(episode_path(run, trial), lambda file: np.savez(file, **arrays, **about))  # type: ignore[arg-type]
 
 
-def load_episode(run: Path, trial: int) -> Trajectory | None:
+def load_episode(run: Path, trial: int) -> Episode | None:
     """The episode of a trial, or None when it was never finished. Raises RunError for an unreadable file."""
     path = episode_path(run, trial)
     if not path.exists():
         return None
-    from pegasus_jax.types import Trajectory
+    from pegasus_jax.types import Episode, Trajectory
 
     with _readable(path) as file:
-        return Trajectory(*(file[name] for name in Trajectory._fields))
+        return Episode(Trajectory(file["x"], file["u"], file["cost"]), str(file["ended"]))
 
 
 def save_imagined(run: Path, trial: int, imagined: Rollout, cost: Any) -> None:

@@ -26,7 +26,7 @@ from pegasus_jax.types import Array, Experiment, RunState, Task
 SOLVED = 0.9  # of a trial's evaluation episodes succeed
 
 # What is a seed's own; the trial is one number for all, so that the random trials are without a search in fact.
-SEEDS = RunState(0, 0, 0, 0, None)  # type: ignore[arg-type]
+SEEDS = RunState(0, 0, 0, 0, None, 0)  # type: ignore[arg-type]
 
 
 def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[str, Any]:
@@ -50,7 +50,7 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
 
     # What lies where: a seed's own on the devices for seeds, the number of the trial on all.
     own, all_the_same = (None, None) if over is None else (mesh.over_seeds(over), mesh.shared(over))
-    laid_out = RunState(own, own, own, own, all_the_same)  # type: ignore[arg-type]
+    laid_out = RunState(own, own, own, own, all_the_same, own)  # type: ignore[arg-type]
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
     states = jax.jit(each(experiment.init, (0,), SEEDS), out_shardings=laid_out)(keys)
     began = time.monotonic()

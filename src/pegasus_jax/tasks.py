@@ -7,6 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from traceback import extract_tb
 from typing import Any
 
 import numpy as np
@@ -14,10 +15,12 @@ import numpy as np
 from pegasus_envs import mjcf
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
-from pegasus_envs.guest import Facts, facts, guest
+from pegasus_envs.gym_plant import EnvSpec, env_plant, env_spec
+from pegasus_envs.gym_plant import close_environments as close_environments
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
+from pegasus_jax import interrupt
 from pegasus_jax.checks import SettingError, nearest
 from pegasus_jax.config import Config
 from pegasus_jax.cost import expected_saturating, saturating, widened
@@ -64,7 +67,7 @@ def make(name: str, legs: int = 2) -> Task:
 
 def of_config(config: Config) -> Task:
     """The task that a config names."""
-    own = {GYM: of_guest, MJCF: of_mjcf}
+    own = {GYM: of_gym, MJCF: of_mjcf}
     return own[config.task](config) if config.task in own else make(config.task, config.legs)
 
 
@@ -108,10 +111,15 @@ def pinned(config: Config) -> Config:
     """
     if config.task == GYM:
         _complete(config)
+        given = {name: getattr(config, name) for name in EnvSpec._fields}
         try:
-            known = facts(config.env or "", **{name: getattr(config, name) for name in Facts._fields})
+            known = env_spec(config.env or "", config.env_args, **given)
         except ValueError as error:
-            raise SettingError(f"env={config.env}: {error}") from error
+            raise SettingError(f"env={config.env}: {' '.join(str(error).split())}") from error
+        except Exception as error:
+            raise SettingError(f"env={config.env} cannot be made: {told(error)}") from error
+        finally:
+            interrupt.reclaim()
         plain = {
             name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known._asdict().items()
         }
@@ -121,18 +129,39 @@ def pinned(config: Config) -> Config:
     return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf), mjcf_digest=mjcf.digest(_model(config)))
 
 
-def of_guest(config: Config) -> Task:
+def of_gym(config: Config) -> Task:
     """The task that a Gymnasium environment and a cost of its observations pose. Raises SettingError if they cannot."""
     _complete(config)
-    known: dict[str, Any] = {name: getattr(config, name) for name in Facts._fields}
+    known: dict[str, Any] = {name: getattr(config, name) for name in EnvSpec._fields}
     if any(value in (None, ()) for value in known.values()):
-        return of_guest(pinned(config))
+        return of_gym(pinned(config))
     known |= {name: np.array(value, float) for name, value in known.items() if isinstance(value, tuple)}
-    name, about = config.env or "", Facts(**known)
+    name, about = config.env or "", EnvSpec(**known)
     states = tuple(f"x{i}" for i in range(len(about.start_mean)))
     controls = tuple(f"u{i}" for i in range(len(about.control_low)))
-    task = _of_users(config, name, guest(name, len(states)), about, about.horizon, states, controls)
-    return task._replace(rates=_entries("rates", config.rates, name, len(states)))
+    task = _of_users(config, name, None, about, about.horizon, states, controls)
+    return task._replace(
+        rates=_entries("rates", config.rates, name, len(states)),
+        environment=env_plant(name, config.env_args, len(states)),
+    )
+
+
+def close(task: Task) -> None:
+    """Close the task's environment, if it has one and it is open."""
+    if task.environment is not None:
+        interrupt.let_go(task.environment.close)
+
+
+def told(error: BaseException) -> str:
+    """What an error says, in one line, with the last line of a user's code that it passed."""
+    ours = {Path(__file__).parent, Path(env_plant.__code__.co_filename).parent}
+    theirs = [
+        frame
+        for frame in extract_tb(error.__traceback__)
+        if Path(frame.filename).parent not in ours and "site-packages" not in frame.filename
+    ]
+    where = f" ({Path(theirs[-1].filename).name}:{theirs[-1].lineno})" if theirs else ""
+    return f"{type(error).__name__}: {' '.join(str(error).split())}{where}"
 
 
 def _complete(config: Config) -> None:
@@ -187,6 +216,8 @@ def _of_users(
         dt=about.dt,
         state_names=states,
         control_names=controls,
+        stop=None if config.stop is None else _function(config.stop),
+        stop_cost=config.stop_cost,
     )
 
 

@@ -1,8 +1,7 @@
 """The main job: an experiment trial by trial, for one seed or many at once, leaving folders that survive anything."""
 
-import logging
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -15,7 +14,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 from tensorboardX import SummaryWriter
 
-from pegasus_jax import checkpoint, record, settings
+from pegasus_jax import checkpoint, episode, record, settings, tasks
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
@@ -24,7 +23,7 @@ from pegasus_jax.program import Program, fetched, leads
 from pegasus_jax.progress import Display, summary
 from pegasus_jax.record import RunError
 from pegasus_jax.trial import COLLECT, EVALUATE, trial_key
-from pegasus_jax.types import Experiment, Key, Learner, Params, RunState, Task, Trajectory
+from pegasus_jax.types import Episode, Experiment, Key, Learner, Params, RunState, Task, Trajectory
 
 # What `improved` says of a trial that has not improved anything.
 UNKNOWN: dict[str, Any] = {
@@ -32,19 +31,23 @@ UNKNOWN: dict[str, Any] = {
     "objective_first": None,
     "objective_last": None,
     "objective_fresh": None,
+    "objective_incumbent": None,
+    "replaced": None,
     "gradient_norm": None,
     "skipped_updates": 0,
 }
 UNMEASURED: dict[str, Any] = {"mean_cost": None, "success_rate": None}  # what `evaluate` says without episodes
 
 
-def train(config: Config, run: Path, *, resume: bool = False, command: str = "") -> RunState:
+def train(config: Config, run: Path, *, resume: bool = False, command: str = "", final: bool = False) -> RunState:
     """Run (or go on with) `config` in the folder `run`, and return the state after its last trial.
+
+    With `final` the last policy runs for one more episode: the first of the next trial, should the run go on.
 
     Killed at any moment and resumed, it ends bit-equal to an uninterrupted run: every trial's randomness is a function
     of seed and trial, finished episodes are read back, and a trial cut short is done again from the state before it.
     """
-    return part(train_seeds(config, {config.seed: run}, resume=resume, command=command), 0)
+    return part(train_seeds(config, {config.seed: run}, resume=resume, command=command, final=final), 0)
 
 
 def train_seeds(
@@ -53,6 +56,7 @@ def train_seeds(
     *,
     resume: bool = False,
     command: str = "",
+    final: bool = False,
     mesh: Mesh | None = None,
     shelf: Path | None = None,
 ) -> RunState:
@@ -72,6 +76,7 @@ def train_seeds(
             raise SettingError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
         set_precision(config)
         experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
+        held.callback(tasks.close, experiment.task)
         program = Program(experiment, config.search.steps, len(seeds), mesh, shelf=shelf)
         display = Display(config.trials, quiet=not leads())
         program.on_compile = display.compiling
@@ -96,14 +101,16 @@ def train_seeds(
             boards.append(held.enter_context(SummaryWriter(str(run / "tensorboard"), purge_step=done + 1)))
         with display.running():
             for trial in range(done + 1, config.trials + 1):
-                with on_plant(experiment.task, f"; resume={folders[0]} goes on from trial {trial}"):
-                    states, rows = one_trial(states, trial, config, folders, experiment, program, display)
+                states, rows = one_trial(states, trial, config, folders, experiment, program, display)
                 whole = fetched(states)
                 for index, board in enumerate(boards):
                     record.write_trials(folders[index], [*record.trials(folders[index]), rows[index]])
                     scalars(board, rows[index])
                     checkpoint.save(folders[index], trial, part(whole, index))
                 display.line(summary(rows, config.trials))
+            if final:
+                display.phase(config.trials, "collect", 1.0)
+                collected(states, config.trials + 1, config, folders, experiment.task, program)
     return states
 
 
@@ -118,9 +125,12 @@ def one_trial(
 ) -> tuple[RunState, list[dict[str, Any]]]:
     """Collect (or read back) episodes, absorb, improve, evaluate; a row a run for its trials.jsonl says how it went."""
     task = experiment.task
-    display.phase(trial, "read" if all(record.episode_path(run, trial).exists() for run in runs) else "collect")
+    on_disk = all(record.episode_path(run, trial).exists() for run in runs)
+    display.phase(trial, "read" if on_disk else "collect")
+    policies = np.asarray(fetched(states.policy_trial))
     episodes = collected(states, trial, config, runs, task, program)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes)
+    shaped = [episode.padded(ran.trajectory, task.horizon) if task.may_end else ran.trajectory for ran in episodes]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *shaped)
     # Before this episode teaches the model, and after another has. No first trial should wait for the compiler.
     judged = trial > max(1, config.explore.trials)
     calibration = fetched(program("calibrate", states, stacked)) if judged else np.full(len(runs), np.nan)
@@ -130,20 +140,24 @@ def one_trial(
     display.phase(trial, "evaluate", 0.9)
     keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(fetched(states.key))
     evaluation = evaluate(keys, states.policy.params, task, program, config.evaluation)
+    random, rows_so_far = trial <= config.explore.trials, np.asarray(fetched(states.data.size))
     seconds = program.seconds()
     rows = [
         {
             "trial": trial,
-            "plant_seconds": round(trial * task.horizon * task.dt, 6),
-            "random": trial <= config.explore.trials,
-            "episode_cost": float(np.mean(episode.cost)),
+            "plant_seconds": round(int(rows_so_far[index]) * task.dt, 6),
+            "random": random,
+            "policy": 0 if random else int(policies[index]),
+            "episode_cost": episode_cost(ran, task),
+            "steps": len(ran.trajectory.u),
+            "ended": ran.ended,
             **evaluation[index],
             **found[index],
-            "saturated": float(saturated(episode.u, task)),
+            "saturated": float(saturated(ran.trajectory.u, task)),
             "calibration": known(calibration[index]),
             "seconds": seconds,
         }
-        for index, episode in enumerate(episodes)
+        for index, ran in enumerate(episodes)
     ]
     return states, rows
 
@@ -151,28 +165,40 @@ def one_trial(
 def improved(
     states: RunState, trial: int, runs: Sequence[Path], stacked: Trajectory, program: Program, display: Display
 ) -> tuple[RunState, list[dict[str, Any]]]:
-    """Fit, search, and imagine what comes; how it went, of each run."""
+    """Fit, search, and imagine what comes; how it went, of each run.
+
+    Raises RunError where no run's model, or no run's policy, could learn anything: nothing would follow from it.
+    """
     display.phase(trial, "fit", 0.02)
+    incumbents = states.policy.params
     states, fitted = fetched_info(program("fit", states))
+    if not np.isfinite(fitted.loss).any():
+        raise RunError(f"trial {trial}: the loss of the model's fit is {float(fitted.loss[0])}, so nothing was learned")
     found = []
     for i in range(program.chunks):
         cost = np.mean(found[-1].objective[:, -1]) if found else None
         display.phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)
         states, searched = fetched_info(program("search", states, jnp.int32(i * program.chunk)))
         found.append(jax.tree.map(np.asarray, searched))
-        program.prepare("imagine")  # once; not before the first of the search, for which everybody waits
+        program.prepare("succeed", incumbents)  # once; not before the first of the search, for which everybody waits
         program.prepare("calibrate", stacked)
     objective, norm = (np.concatenate([getattr(f, name) for f in found], 1) for name in ("objective", "gradient_norm"))
+    if not np.any(np.isfinite(objective) & np.isfinite(norm)):
+        raise RunError(
+            f"trial {trial}: the imagined cost or its gradient is not finite in any iteration, so nothing was learned"
+        )
     skipped = fitted.skipped + sum(f.skipped for f in found)
-    imagined, imagined_cost = fetched(program("imagine", states))
+    states, successor = fetched_info(program("succeed", states, incumbents, purpose="imagine"))
     for index, run in enumerate(runs if leads() else ()):
-        record.save_imagined(run, trial, part(imagined, index), imagined_cost[index])
+        record.save_imagined(run, trial, part(successor.rollout, index), successor.cost[index])
     return states, [
         {
             "fit_loss": float(fitted.loss[index]),
             "objective_first": float(objective[index, 0]),
             "objective_last": float(objective[index, -1]),
-            "objective_fresh": float(jnp.mean(imagined_cost[index])),
+            "objective_fresh": float(jnp.mean(successor.cost[index])),
+            "objective_incumbent": known(successor.incumbent[index]),
+            "replaced": bool(successor.replaced[index]),
             "gradient_norm": float(np.median(norm[index])),
             "skipped_updates": int(skipped[index]),
         }
@@ -182,49 +208,86 @@ def improved(
 
 def collected(
     states: RunState, trial: int, config: Config, runs: Sequence[Path], task: Task, program: Program
-) -> list[Trajectory]:
-    """The episodes of a trial: those on disk as they are, the others run on the plant and made durable."""
+) -> list[Episode]:
+    """The episodes of a trial: those on disk as they are, the others run on the plant and made durable.
+
+    Raises RunError where one failed, which is on disk as far as it came, or is not made of finite numbers; and
+    KeyboardInterrupt where a signal ended it.
+    """
     episodes = [record.load_episode(run, trial) for run in runs]
-    if any(episode is None for episode in episodes):
+    if any(ran is None for ran in episodes):
         keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(fetched(states.key))
-        exploring = jnp.asarray(trial <= config.explore.trials)
-        fresh = fetched(program("episode", keys, states.policy.params, exploring, purpose="collect"))
+        random = trial <= config.explore.trials
+        fresh = program.collect(keys, states.policy.params, random)
+        policies = np.asarray(fetched(states.policy_trial))
         for index, run in enumerate(runs):
             if episodes[index] is None:
-                episodes[index] = part(fresh, index)
-                if leads():
-                    record.save_episode(run, trial, part(fresh, index), task)
-    return [episode for episode in episodes if episode is not None]
+                episodes[index] = ran = fresh[index]
+                finite(ran.trajectory, task, trial)
+                if leads() and len(ran.trajectory.u):
+                    record.save_episode(
+                        run, trial, ran.trajectory, task, policy=0 if random else int(policies[index]), ended=ran.ended
+                    )
+                failed(ran, task, f"; resume={run} goes on")
+    found = [ran for ran in episodes if ran is not None]
+    for ran in found:
+        costed(ran.trajectory, task, trial)
+    return found
 
 
-@contextmanager
-def on_plant(task: Task, advice: str = "") -> Iterator[None]:
-    """What a plant on the host raises becomes one line, Ctrl-C itself; JAX would show a traceback of its insides."""
-    logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
-    trouble: list[BaseException] = getattr(task.plant, "trouble", [])
-    trouble.clear()
-    try:
-        yield
-    except jax.errors.JaxRuntimeError as error:
-        if not trouble:
-            raise
-        cause = trouble[-1]
-        if isinstance(cause, KeyboardInterrupt):
-            raise cause from error
-        where = "".join(f" ({note})" for note in getattr(cause, "__notes__", []))
-        what = " ".join(f"{type(cause).__name__}: {cause}{where}".split())
-        raise RunError(f"{task.name} failed in an episode, {what}{advice}") from error
+def finite(trajectory: Trajectory, task: Task, trial: int) -> None:
+    """Raises RunError, which names trial and entry, for an episode that no model can learn from."""
+    x = np.asarray(trajectory.x)
+    for t, i in np.argwhere(~np.isfinite(x))[:1]:
+        raise RunError(
+            f"trial {trial}: {task.state_names[i]} is {x[t, i]} after {t} control periods of its episode;"
+            " the plant's simulation diverged: a smaller time step or softer parts may help"
+        )
+
+
+def costed(trajectory: Trajectory, task: Task, trial: int) -> None:
+    """Raises RunError, which names trial and state, where the cost of an episode is not a finite number."""
+    cost, x = np.asarray(trajectory.cost), np.asarray(trajectory.x)
+    for (t,) in np.argwhere(~np.isfinite(cost))[:1]:
+        raise RunError(f"trial {trial}: the cost of the observation {x[t + 1].tolist()} is {cost[t]}; mend the cost")
+
+
+def failed(ran: Episode, task: Task, advice: str = "") -> None:
+    """Raise what ended an episode on an environment before its time: RunError in one line, or the signal itself."""
+    if isinstance(ran.error, KeyboardInterrupt):
+        raise ran.error
+    if ran.error is not None:
+        kept = f"; its {len(ran.trajectory.u)} rows are kept" if len(ran.trajectory.u) else ""
+        raise RunError(f"{task.name} failed in an episode, {tasks.told(ran.error)}{kept}{advice}") from ran.error
 
 
 def evaluate(keys: Key, params: Params, task: Task, program: Program, episodes: int) -> list[dict[str, Any]]:
     """Mean cost a step and success rate of each seed [S], over fresh episodes, not data (docs/reference.md 10)."""
     if not episodes:
         return [UNMEASURED] * len(keys)
-    costs = program.evaluate(jax.vmap(lambda key: jax.random.split(key, episodes))(keys), params)
+    keys = jax.vmap(lambda key: jax.random.split(key, episodes))(keys)
+    costs = program.evaluate(keys, params) if task.environment is None else driven(keys, params, task, program)
     return [
         {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(success))}
         for cost, success in zip(costs, succeeded(costs, task), strict=True)
     ]
+
+
+def driven(keys: Key, params: Params, task: Task, program: Program) -> np.ndarray:
+    """Costs [S, E, H] of episodes on an environment, the periods that an early end left out included."""
+    costs = []
+    for some in jnp.swapaxes(keys, 0, 1):
+        for ran in program.collect(some, params, False, purpose="evaluate"):
+            failed(ran, task)
+            costs.append(episode.charged(ran.trajectory.cost, task))
+    return np.reshape(costs, (keys.shape[1], keys.shape[0], task.horizon)).swapaxes(0, 1)
+
+
+def episode_cost(ran: Episode, task: Task) -> float:
+    """Mean cost a step of an episode: the same number when it was just run and when it is read back."""
+    cost = np.asarray(ran.trajectory.cost, np.float64)
+    cut_short = ran.ended in ("error", "interrupted")  # nobody knows what would have come
+    return float(np.mean(cost if cut_short else episode.charged(cost, task)))
 
 
 def succeeded(costs: Any, task: Task) -> np.ndarray:
@@ -303,8 +366,10 @@ def evaluate_run(run: Path, episodes: int, seed: int, shelf: Path | None = None)
     program = Program(experiment, 1, shelf=shelf)
     params = jax.tree.map(lambda leaf: leaf[None], state.policy.params)
     keys = jax.random.key(seed)[None]
-    with on_plant(experiment.task):
+    try:
         (result,) = evaluate(keys, params, experiment.task, program, episodes)
+    finally:
+        tasks.close(experiment.task)
     return {"trial": int(state.trial), "episodes": episodes, **result, "fingerprint": checkpoint.fingerprint(state)}
 
 
