@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
-    0: "types checks config variants interrupt",
+    0: "types checks config variants defaults interrupt",
     1: "angles mesh quantile dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout"
     " episode calibration",
     2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco",
@@ -28,6 +28,7 @@ TOP = max(LAYERS)  # the layer that is an application: here modules may import e
 # (importer, imported), both of one layer below TOP.
 SIBLINGS: set[tuple[str, str]] = {
     ("config", "checks"),  # a setting is checked when it is made
+    ("defaults", "config"),  # what a task changes in them; a folder's name is made of them
     ("variants", "config"),  # a variant is made of settings
     ("dropout", "quantile"),  # uniform draws, and what makes a truncated normal of them
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap

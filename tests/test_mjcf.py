@@ -18,6 +18,7 @@ from pegasus_envs.render import frames
 from pegasus_jax import record, settings, tasks
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
+from pegasus_jax.defaults import label
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
 PENDULUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "inverted_pendulum.xml"
@@ -116,7 +117,7 @@ def test_a_file_is_known_by_its_content() -> None:
 
 def test_folders_tell_tasks_apart() -> None:
     labels = [
-        tasks.label(made)
+        label(made)
         for made in (
             config("some/arm.xml"),
             Config(task="gym", env="package:ns/Pendulum-v1"),

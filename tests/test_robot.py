@@ -85,7 +85,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = tmp_path_factory.mktemp("robot")
     code, _, err = call("train", *WORDS, *TINY, "horizon=5", "out=run", cwd=home)
     assert code == 0, err
-    assert "cost of its episode" in err
+    assert "episode by the policy of trial 1: cost" in err
     return home
 
 
@@ -169,7 +169,7 @@ def test_ctrl_c_in_the_middle_of_an_episode(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, "Traceback" in err) == (130, False), err
-    assert err.splitlines()[-1].startswith("stopped; every finished episode is kept")
+    assert err.splitlines()[-1] == "stopped; every finished episode is kept, pegasus-train resume=run goes on"
     assert asked(tmp_path)[-1] == "close"
 
 

@@ -10,7 +10,7 @@ from pegasus_jax import settings
 from pegasus_jax.build import compose
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import BNN, RBF, Analytic, Config, Lagrangian, Period, Search
-from pegasus_jax.tasks import defaults
+from pegasus_jax.defaults import defaults
 from pegasus_jax.variants import KINDS, MODELS, POLICIES
 from probes import cart
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
-from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco, scenarios, tasks, trial
+from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco, scenarios, tasks
 from pegasus_jax import config as settings
 from pegasus_jax.checks import SettingError
 from pegasus_jax.cost import of_particles
@@ -30,6 +30,7 @@ from pegasus_jax.policy.squash import SQUASHES, to_limits
 from pegasus_jax.population import best_of
 from pegasus_jax.rollout import NoiseUse, rollout
 from pegasus_jax.search import keeping_best, objective, particles, remembering
+from pegasus_jax.trial import experiment
 from pegasus_jax.types import (
     Array,
     Dropout,
@@ -80,7 +81,7 @@ def compose(
     searcher, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)
     explore = config.explore
-    return trial.experiment(
+    return experiment(
         task=task,
         dynamics=dynamics,
         policy=policy,

@@ -19,8 +19,8 @@ pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that 
                                                 fit.* or search.* settings
 
   task=cartpole         what to learn: {tasks}
-  model=log_normal      dynamics model: {models};
-                        with task=cartpole it is lagrangian unless you say otherwise
+  model=log_normal      dynamics model: {models}
+                        (default: the one that learns the task best, of cartpole and double_cartpole lagrangian)
   policy=mlp            controller: {policies}
   algorithm=pegasus     how to search: {algorithms}
   out=runs/...          the run's folder (default: runs/TASK-seedN)
@@ -35,6 +35,9 @@ A task and a named variant bring their own values of the settings below, which c
 they are with the words beside --help: pegasus-train task=gym algorithm=paper --help
 {settings}
 {others}
+PEGASUS_SETTINGS="fit.steps=5 search.steps=5" in the environment adds these words to every pegasus-train and
+pegasus-figures command, after those that are typed: of two values of a setting, the last one counts.
+
 examples
   pegasus-train task=cartpole
   pegasus-train task=cartpole policy.hidden=[50,50] seed=3 trials=10 out=runs/demo
@@ -46,8 +49,8 @@ examples
   pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
   pegasus-train resume=runs/demo trials=20 search.steps=2000
 
-Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, pegasus-play RUN, or
-tensorboard --logdir RUN/tensorboard.
+Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN or pegasus-play RUN; or with
+tensorboard --logdir RUN/tensorboard, after pip install tensorboard.
 """
 
 EVALUATE = """\
@@ -145,7 +148,7 @@ OPTIONS = (
 
 
 def _train(words: Sequence[str]) -> None:
-    from pegasus_jax import record, settings, tasks
+    from pegasus_jax import defaults, progress, record, settings
 
     options, rest = settings.split(words, OPTIONS)
     command = shlex.join(["pegasus-train", *words])
@@ -165,12 +168,14 @@ def _train(words: Sequence[str]) -> None:
         config = settings.parse(rest, options=OPTIONS)
         seeds = range(config.seed, config.seed + whole("seeds", options.get("seeds", "1")))
         name = f"seed{seeds[0]}" if len(seeds) == 1 else f"seeds{seeds[0]}-{seeds[-1]}"
-        home = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{tasks.label(config)}-{name}"))
+        home = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{defaults.label(config)}-{name}"))
         runs = {config.seed: home} if len(seeds) == 1 else {seed: home / f"seed{seed}" for seed in seeds}
-    if len(runs) > 1 and config.task == tasks.GYM:
+    if len(runs) > 1 and config.task == defaults.GYM:
         raise SettingError(f"seeds={len(runs)} is too many for task=gym, whose environment is one object; seeds=1")
     if options.get("final", "false") not in ("true", "false"):
         raise SettingError(f"final={options['final']} is neither true nor false")
+    done = len(record.trials(first)) if "resume" in options else None
+    print(progress.announcement(config, home, len(runs), done), flush=True)
     _join(options)
     from pegasus_jax.program import leads, share_processors
 
@@ -179,8 +184,11 @@ def _train(words: Sequence[str]) -> None:
         search = config.search
         share_processors(len(runs), search.particles * search.starts if isinstance(search, Search) else None)
     over = _mesh(options.get("mesh"), len(runs))
-    if "resume" not in options:
-        config = tasks.pinned(config)
+    if leads():
+        print(progress.devices(), flush=True)
+    from pegasus_jax.tasks import pinned
+
+    config = config if "resume" in options else pinned(config)
     from pegasus_jax.build import build
 
     kept = _shelf(config, len(runs))
@@ -193,7 +201,10 @@ def _train(words: Sequence[str]) -> None:
     from pegasus_jax.train import train_seeds
 
     final = options.get("final") == "true"
-    train_seeds(config, runs, resume="resume" in options, command=command, final=final, mesh=over, shelf=kept)
+    try:
+        train_seeds(config, runs, resume="resume" in options, command=command, final=final, mesh=over, shelf=kept)
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(progress.stopped(home)) from None
     if leads():
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
 
@@ -357,7 +368,7 @@ def _help(text: str, words: Sequence[str]) -> str:
     if "{settings}" not in text:
         return text
     from pegasus_jax import settings
-    from pegasus_jax.tasks import NAMES
+    from pegasus_jax.defaults import NAMES
     from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 
     named = dict(tasks=NAMES, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
@@ -389,9 +400,10 @@ def main(
     interrupt.before_end(_let_robots_go)
     try:
         code = _code(command, words, text)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         interrupt.clean_up()
-        print(f"stopped; {stopped}", file=sys.stderr)
+        told = [word for word in stop.args if isinstance(word, str)]
+        print(told[0] if told else f"stopped; {stopped}", file=sys.stderr)
         code = interrupt.status()
     except BaseException:
         interrupt.clean_up()
@@ -413,6 +425,7 @@ def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: 
     from pegasus_jax.record import RunError
 
     try:
+        words = [*words, *(_always() if words and command in (_train, _figures) else ())]
         if not words or HELP & {*words}:
             print(_help(text, words), end="")
             return 0 if words else 2
@@ -425,11 +438,18 @@ def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: 
     return 0
 
 
-def _remember_compilations() -> None:
-    """Keep compiled programs in the user's cache folder, unless JAX was told where already."""
-    import jax
+def _always() -> list[str]:
+    """The words of PEGASUS_SETTINGS, which come after those that were typed."""
+    text = os.environ.get("PEGASUS_SETTINGS", "")
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise SettingError(f"PEGASUS_SETTINGS={text} cannot be read: {error}; expected key=value words") from error
 
+
+def _remember_compilations() -> None:
+    """Keep compiled programs in the user's cache folder, unless JAX, which is not imported yet, is told where."""
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pegasus_jax"
-        jax.config.update("jax_compilation_cache_dir", str(cache))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache)
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")

@@ -4,6 +4,7 @@ import os
 import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -55,12 +56,16 @@ class Jitted:
         self.coming: Future | None = None
         self.kept, self.options = kept, options  # where it is on disk, and how it was made
 
-    def __call__(self, *arguments: Any) -> Any:
+    def ready(self, *arguments: Any) -> None:
+        """Wait until it is compiled for arguments of these shapes."""
         if self.compiled is None:
             began = time.monotonic()
             self.compiled = (self.coming or begun(self.compile, *arguments)).result()
             self.seconds = time.monotonic() - began
-        compiled = self.compiled
+
+    def __call__(self, *arguments: Any) -> Any:
+        self.ready(*arguments)
+        compiled: Any = self.compiled
         return begun(lambda: jax.block_until_ready(compiled(*arguments))).result()
 
     def compile(self, *arguments: Any) -> Any:
@@ -115,6 +120,8 @@ class Program:
             for name, (function, axes) in functions.items()
         }
         self.spent: dict[str, float] = {}
+        # Told of a part while its caller waits for the compiler; whoever shows progress puts its own here.
+        self.on_compile: Callable[[str], AbstractContextManager[Any]] = nullcontext
 
     def prepare(self, part: str, *others: Any) -> None:
         """Begin to compile a part of states and `others`, or of states and a whole number, while others are at work."""
@@ -141,6 +148,9 @@ class Program:
         if self.mesh is not None:
             arguments = self.laid_out(part, arguments, placed)
         began, compiled = time.monotonic(), jitted.seconds
+        if jitted.compiled is None:
+            with self.on_compile(part):
+                jitted.ready(*arguments)
         result = jitted(*arguments)
         compiling = jitted.seconds - compiled
         self.spent[name] = self.spent.get(name, 0.0) + time.monotonic() - began - compiling

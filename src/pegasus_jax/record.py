@@ -11,6 +11,8 @@
 Files appear whole or not at all: written beside their place, flushed to disk, then renamed.
 """
 
+from __future__ import annotations
+
 import json
 import os
 import platform
@@ -21,14 +23,15 @@ from collections.abc import Callable
 from functools import cache
 from importlib import metadata
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 from filelock import FileLock, Timeout
 
 from pegasus_jax.checks import SettingError
-from pegasus_jax.types import Episode, Rollout, Task, Trajectory
+
+if TYPE_CHECKING:  # JAX is imported where it is needed: a command names its folder before it waits for that
+    from pegasus_jax.types import Episode, Rollout, Task, Trajectory
 
 
 class RunError(Exception):
@@ -127,6 +130,8 @@ def load_episode(run: Path, trial: int) -> Episode | None:
     path = episode_path(run, trial)
     if not path.exists():
         return None
+    from pegasus_jax.types import Episode, Trajectory
+
     with _readable(path) as file:
         return Episode(Trajectory(file["x"], file["u"], file["cost"]), str(file["ended"]))
 
@@ -173,6 +178,8 @@ def processors() -> int:
 
 def about(command: str) -> dict[str, Any]:
     """Versions, machine and command: what somebody else needs to repeat the run."""
+    import jax
+
     packages = ("pegasus-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
     versions = {}
     for name in packages:

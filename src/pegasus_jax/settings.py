@@ -9,14 +9,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from pegasus_jax import tasks
 from pegasus_jax.checks import SettingError, nearest
 from pegasus_jax.config import Config
+from pegasus_jax.defaults import BEST, NAMES, defaults
 from pegasus_jax.record import write_whole
 from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 
 # Keys that select a named variant, and what they select from.
-VARIANTS: dict[str, Any] = {"task": tasks.NAMES, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
+VARIANTS: dict[str, Any] = {"task": NAMES, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
 
 
 def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, str], dict[str, str]]:
@@ -41,7 +41,7 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     task, algorithm = chosen.get("task", Config.task), chosen.get("algorithm", "pegasus")
     # What suits a task best goes with the best algorithm and where no model is named; the rest is the paper's.
     own = algorithm == "pegasus" and "model" not in chosen
-    best, changes = tasks.BEST.get(task, ("log_normal", {})) if own else (chosen.get("model", "log_normal"), {})
+    best, changes = BEST.get(task, ("log_normal", {})) if own else (chosen.get("model", "log_normal"), {})
     variants: dict[str, Any] = {
         **MODELS[best],
         **changes,
@@ -51,7 +51,7 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     sections = {name: value for name, value in variants.items() if dataclasses.is_dataclass(value)}
     config = dataclasses.replace(Config(task=task), **sections)
     config = override(config, values({key: words[key] for key in ("legs",) if key in words}))
-    for changes in (tasks.defaults(config.task, config.legs), {k: v for k, v in variants.items() if k not in sections}):
+    for changes in (defaults(config.task, config.legs), {k: v for k, v in variants.items() if k not in sections}):
         there = leaves(config)
         config = override(config, {key: value for key, value in changes.items() if key in there})
     known = leaves(config)

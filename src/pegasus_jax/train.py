@@ -20,7 +20,7 @@ from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
 from pegasus_jax.dataset import grow
 from pegasus_jax.program import Program, fetched, leads
-from pegasus_jax.progress import Display
+from pegasus_jax.progress import Display, summary
 from pegasus_jax.record import RunError
 from pegasus_jax.trial import COLLECT, EVALUATE, trial_key
 from pegasus_jax.types import Episode, Experiment, Key, Learner, Params, RunState, Task, Trajectory
@@ -78,10 +78,11 @@ def train_seeds(
         experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
         held.callback(tasks.close, experiment.task)
         program = Program(experiment, config.search.steps, len(seeds), mesh, shelf=shelf)
-        display = Display(config.trials, 0, quiet=not leads())
+        display = Display(config.trials, quiet=not leads())
+        program.on_compile = display.compiling
         states = together(folders, replace(before, seed=0), display) if resume else None
-        done = display.done = 0 if states is None else int(states.trial[0])
-        if done < config.trials:
+        done = 0 if states is None else int(states.trial[0])
+        if max(done + 1, config.explore.trials) <= config.trials:  # else no policy is searched
             program.prepare("search")
         keys = jnp.stack([jax.random.key(seed) for seed in seeds])
         if states is None:
@@ -124,7 +125,8 @@ def one_trial(
 ) -> tuple[RunState, list[dict[str, Any]]]:
     """Collect (or read back) episodes, absorb, improve, evaluate; a row a run for its trials.jsonl says how it went."""
     task = experiment.task
-    display.phase(trial, "collect")
+    on_disk = all(record.episode_path(run, trial).exists() for run in runs)
+    display.phase(trial, "read" if on_disk else "collect")
     policies = np.asarray(fetched(states.policy_trial))
     episodes = collected(states, trial, config, runs, task, program)
     shaped = [episode.padded(ran.trajectory, task.horizon) if task.may_end else ran.trajectory for ran in episodes]
@@ -352,7 +354,7 @@ def newest(run: Path) -> tuple[Config, Experiment, RunState]:
     """A run's config, its experiment and its newest whole state. Raises RunError when there is none yet."""
     config = settings.load(run / "config.yaml")
     set_precision(config)
-    states = together([run], config, Display(config.trials, 0))
+    states = together([run], config, Display(config.trials))
     if states is None:
         raise RunError(f"{run} has no checkpoint that this version can use yet; resume={run} makes one")
     return config, build(config), part(states, 0)
@@ -376,27 +378,3 @@ def scalars(board: SummaryWriter, row: dict[str, Any]) -> None:
     for name, value in {**row, **{f"seconds/{k}": v for k, v in row["seconds"].items()}}.items():
         if isinstance(value, int | float):
             board.add_scalar(name, value, row["trial"])
-
-
-def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
-    """A trial in one line; over several seeds the means, and the median calibration."""
-    measured = rows[0]["mean_cost"] is not None
-    names = ("mean_cost", "success_rate") if measured else ("episode_cost",)
-    mean = {name: np.mean([row[name] for row in rows]) for name in names}
-    imagined = [row["objective_last"] for row in rows if row["objective_last"] is not None]
-    first, skipped = rows[0], sum(row["skipped_updates"] for row in rows)
-    solved = sum(row["success_rate"] >= 0.9 for row in rows) if measured else 0
-    errors = [row["calibration"] for row in rows if row["calibration"] is not None]
-    return (
-        f"trial {first['trial']:>2}/{trials}  {first['plant_seconds']:6.1f} s of plant"
-        + (
-            f"  cost {mean['mean_cost']:.3f}  success {mean['success_rate']:4.0%}"
-            if measured
-            else f"  cost of its episode {mean['episode_cost']:.3f}"
-        )
-        + (f"  imagined {np.mean(imagined):.3f}" if imagined else "")
-        + (f"  calibration {np.median(errors):.1f}" if errors else "")
-        + (f"  {solved} of {len(rows)} seeds solved" if measured and len(rows) > 1 else "")
-        + f"  ({sum(first['seconds'].values()):.0f} s, {first['seconds']['compile']:.0f} s of it compiling)"
-        + (f"  {skipped} updates skipped" if skipped else "")
-    )
