@@ -396,9 +396,9 @@ def main(
     Whatever ends it, a robot is let go first, and no thread that still compiles is waited for.
     """
     words = sys.argv[1:]
-    interrupt.listen()
     interrupt.before_end(_let_robots_go)
     try:
+        interrupt.listen()
         code = _code(command, words, text)
     except KeyboardInterrupt as stop:
         interrupt.clean_up()

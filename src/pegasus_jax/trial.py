@@ -131,6 +131,8 @@ def experiment(
         return found._replace(trajectory=found.trajectory._replace(cost=cost))
 
     def driven(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
+        if isinstance(key, Tracer):
+            raise ValueError(f"task {task.name} has an environment, which nothing can trace: call this outside of jit")
         found = drive(key, policy_params, bool(exploring))
         if found.error is not None:
             raise found.error
@@ -282,6 +284,8 @@ def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunStat
 def run(exp: Experiment, trials: int, episodes: int = 20) -> Callable[[Key], tuple[RunState, TrialInfo]]:
     """key -> (state, TrialInfo [T, ...]): a whole run as one function; jit(vmap(run(...)))(keys) is a study."""
 
+    if exp.drive is not None:
+        raise ValueError(f"task {exp.task.name} has an environment, which no program can hold; use pegasus_jax.train")
     room = jax.eval_shape(exp.init, jax.random.key(0)).data.x.shape[0] // exp.task.horizon
     if trials > room:
         raise ValueError(
