@@ -146,6 +146,8 @@ OPTIONS = (
     "process",
 )  # of pegasus-train
 
+_begun: list[Path] = []  # the folder of what this process learns, for whoever stops it
+
 
 def _train(words: Sequence[str]) -> None:
     from pegasus_jax import defaults, progress, record, settings
@@ -176,6 +178,7 @@ def _train(words: Sequence[str]) -> None:
         raise SettingError(f"final={options['final']} is neither true nor false")
     done = len(record.trials(first)) if "resume" in options else None
     print(progress.announcement(config, home, len(runs), done), flush=True)
+    _begun.append(home)
     _join(options)
     from pegasus_jax.program import leads, share_processors
 
@@ -201,10 +204,7 @@ def _train(words: Sequence[str]) -> None:
     from pegasus_jax.train import train_seeds
 
     final = options.get("final") == "true"
-    try:
-        train_seeds(config, runs, resume="resume" in options, command=command, final=final, mesh=over, shelf=kept)
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(progress.stopped(home)) from None
+    train_seeds(config, runs, resume="resume" in options, command=command, final=final, mesh=over, shelf=kept)
     if leads():
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
 
@@ -400,16 +400,21 @@ def main(
     try:
         interrupt.listen()
         code = _code(command, words, text)
-    except KeyboardInterrupt as stop:
+    except KeyboardInterrupt:
         interrupt.clean_up()
-        told = [word for word in stop.args if isinstance(word, str)]
-        print(told[0] if told else f"stopped; {stopped}", file=sys.stderr)
+        print(_stopped(_begun[0]) if _begun else f"stopped; {stopped}", file=sys.stderr)
         code = interrupt.status()
     except BaseException:
         interrupt.clean_up()
         raise
     interrupt.clean_up()
     interrupt.end(code)
+
+
+def _stopped(home: Path) -> str:
+    from pegasus_jax.progress import stopped
+
+    return stopped(home)
 
 
 def _let_robots_go() -> None:

@@ -33,7 +33,7 @@ PARTS = {
     "absorb": "the data set",
     "fit": "the fit",
     "search": "the search",
-    "imagine": "the imagined rollouts",
+    "succeed": "the imagined rollouts",
     "calibrate": "the test of the model",
     "evaluate": "the evaluation",
 }

@@ -79,7 +79,7 @@ def train_seeds(
         held.callback(tasks.close, experiment.task)
         program = Program(experiment, config.search.steps, len(seeds), mesh, shelf=shelf)
         display = Display(config.trials, quiet=not leads())
-        program.on_compile = display.compiling
+        program.on_compile = held.enter_context(display.running()).compiling
         states = together(folders, replace(before, seed=0), display) if resume else None
         done = 0 if states is None else int(states.trial[0])
         if max(done + 1, config.explore.trials) <= config.trials:  # else no policy is searched
@@ -99,18 +99,17 @@ def train_seeds(
             record.note(run, command, done)
             record.write_trials(run, record.trials(run)[:done])
             boards.append(held.enter_context(SummaryWriter(str(run / "tensorboard"), purge_step=done + 1)))
-        with display.running():
-            for trial in range(done + 1, config.trials + 1):
-                states, rows = one_trial(states, trial, config, folders, experiment, program, display)
-                whole = fetched(states)
-                for index, board in enumerate(boards):
-                    record.write_trials(folders[index], [*record.trials(folders[index]), rows[index]])
-                    scalars(board, rows[index])
-                    checkpoint.save(folders[index], trial, part(whole, index))
-                display.line(summary(rows, config.trials))
-            if final:
-                display.phase(config.trials, "collect", 1.0)
-                collected(states, config.trials + 1, config, folders, experiment.task, program)
+        for trial in range(done + 1, config.trials + 1):
+            states, rows = one_trial(states, trial, config, folders, experiment, program, display)
+            whole = fetched(states)
+            for index, board in enumerate(boards):
+                record.write_trials(folders[index], [*record.trials(folders[index]), rows[index]])
+                scalars(board, rows[index])
+                checkpoint.save(folders[index], trial, part(whole, index))
+            display.line(summary(rows, config.trials))
+        if final:
+            display.phase(config.trials, "collect", 1.0)
+            collected(states, config.trials + 1, config, folders, experiment.task, program)
     return states
 
 
