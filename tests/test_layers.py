@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 LAYERS = {
     0: "types checks config variants",
     1: "angles mesh quantile dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout"
-    " episode calibration",
+    " episode calibration user_code",
     2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco",
     3: "dynamics. policy. trial",
     4: "tasks",

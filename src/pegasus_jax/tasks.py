@@ -2,10 +2,8 @@
 
 import dataclasses
 import os
-import sys
 from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from pathlib import Path
 from typing import Any, get_args
 
@@ -19,6 +17,7 @@ from pegasus_envs.guest import Facts, facts, guest
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
+from pegasus_jax import user_code
 from pegasus_jax.checks import SettingError, nearest
 from pegasus_jax.config import Config
 from pegasus_jax.cost import expected_saturating, saturating, widened
@@ -240,7 +239,7 @@ def _complete(config: Config) -> None:
     """Raises SettingError unless an environment is named, and a cost that there is: no robot is opened in vain."""
     if config.env is None or config.cost is None:
         raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
-    _function(config.cost)  # from now on modules in the working folder are found, the environment's too
+    user_code.load("cost", config.cost)  # from now on modules in the working folder are found, the environment's too
 
 
 def of_mjcf(config: Config) -> Task:
@@ -277,7 +276,7 @@ def _of_users(
     return Task(
         name=name,
         plant=plant,
-        cost=_function(config.cost or ""),
+        cost=user_code.load("cost", config.cost or ""),
         angles=_entries("angles", config.angles, name, len(states)),
         start_mean=about.start_mean,
         start_std=about.start_std,
@@ -299,17 +298,6 @@ def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> 
                 f"{setting}={entry} is not an entry of {name}'s observation; choose from 0 to {states - 1}"
             )
     return entries
-
-
-def _function(name: str) -> Callable[[Any], Any]:
-    """The function `module:function`, also from a module in the working folder."""
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
-    module, _, function = name.partition(":")
-    try:
-        return getattr(import_module(module), function)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise SettingError(f"cost={name} cannot be imported: {error}; expected cost=module:function") from error
 
 
 def pictures(task: Task, states: Any, width: int, height: int) -> list[np.ndarray]:
