@@ -17,7 +17,7 @@ LAYERS = {
     0: "types checks config variants",
     1: "angles mesh quantile dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout"
     " episode calibration user_code",
-    2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco",
+    2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco cost_check",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",

@@ -5,7 +5,7 @@ import importlib.util
 import os
 import sys
 import sysconfig
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from inspect import unwrap
 from pathlib import Path
@@ -74,7 +74,7 @@ def _places(module: str, what: str) -> list[Path]:
     """The file of a module, or the folders of a package without one."""
     loaded = sys.modules.get(module)
     if loaded is not None and getattr(loaded, "__spec__", None) is None:  # made by a program, or the program itself
-        return [Path(loaded.__file__)] if getattr(loaded, "__file__", None) else []
+        return [Path(file)] if (file := getattr(loaded, "__file__", None)) else []
     try:
         with blamed(what or module, imports=True):
             spec = importlib.util.find_spec(module)
@@ -123,10 +123,15 @@ def line_of(error: BaseException) -> str | None:
     """`file.py:line` of the last of the user's lines that an error went through; None where there is none."""
     if isinstance(error, SyntaxError) and error.filename:
         return f"{Path(error.filename).name}:{error.lineno}"
-    frames = [frame for frame in extract_tb(error.__traceback__) if _users(frame.filename)]
-    own = [frame for frame in frames if not {*INSTALLED} & {*Path(frame.filename).parts}]
-    for frame in (own or frames)[-1:]:
-        return f"{Path(frame.filename).name}:{frame.lineno}"
+    return place_of([(frame.filename, frame.lineno or 0) for frame in extract_tb(error.__traceback__)])
+
+
+def place_of(lines: Iterable[tuple[str, int]]) -> str | None:
+    """`file.py:line` of the last of these (file, line) that is the user's, if it can be not an installed package's."""
+    theirs = [(file, line) for file, line in lines if _users(file)]
+    own = [(file, line) for file, line in theirs if not {*INSTALLED} & {*Path(file).parts}]
+    for file, line in (own or theirs)[-1:]:
+        return f"{Path(file).name}:{line}"
     return None
 
 
