@@ -107,7 +107,9 @@ def test_an_environment_rests_once_it_has_ended() -> None:
 
 def test_an_environment_is_never_asked_for_two_episodes_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """A GPU evaluates a plant in JAX twenty times side by side."""
-    config = Config(task="gym", env="Pendulum-v1", cost="math:cos", start_mean=(0.0,), search=Search(widen=1.0))
+    config = Config(
+        task="gym", env="Pendulum-v1", cost="math:cos", start_mean=(0.0, 0.0, 0.0), search=Search(widen=1.0)
+    )
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(program, "compiler_options", lambda _: {})
     assert not program.Program(build(config), 1).side_by_side

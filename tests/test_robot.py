@@ -211,11 +211,13 @@ def test_facts_that_are_given_are_not_asked_for() -> None:
     np.testing.assert_array_equal(known.start_std, [0.1, 0.1])
     assert (known.dt, known.horizon) == (0.1, 100)
     with pytest.raises(ValueError, match="give control_low= and control_high="):
-        facts("Bounds-v0", start_mean=[0])
+        facts("Bounds-v0", start_mean=[0, 0])
     with pytest.raises(ValueError, match="controls from -2 to 2 are not among its own, from -1 to 1"):
-        facts("Bounds-v0", control_low=[-2], control_high=[2], start_mean=[0])
+        facts("Bounds-v0", control_low=[-2], control_high=[2], start_mean=[0, 0])
     with pytest.raises(ValueError, match="start_mean has 3 entries; expected 2"):
         facts("Bounds-v0", control_low=[-1], control_high=[1], start_mean=[0, 0, 0])
+    with pytest.raises(ValueError, match="start_mean has 1 entries; expected 2"):
+        facts("Bounds-v0", control_low=[-1], control_high=[1], start_mean=[0])
 
 
 def test_runs_that_were_not_evaluated_have_no_curves_to_compare(learned: Path) -> None:

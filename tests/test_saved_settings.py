@@ -62,7 +62,7 @@ configs = st.builds(
         cost_noise=st.floats(0, 10),
         period=st.builds(Period, *[whole(0)] * 5),
     ),
-    explore=st.builds(Explore, trials=whole(0), kind=st.sampled_from(config.EXPLORATIONS)),
+    explore=st.builds(Explore, trials=st.integers(0, 10**4), kind=st.sampled_from(config.EXPLORATIONS)),
 )
 
 

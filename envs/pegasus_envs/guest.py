@@ -94,7 +94,7 @@ def facts(
                 f"controls from {least:g} to {greatest:g} are not among its own, from {bottom:g} to {top:g}"
             )
     size, rest = seen.shape[0], np.zeros(seen.shape)
-    given = filled("start_mean", start_mean, size, rest), filled("start_std", start_std, size, rest)
+    given = filled("start_mean", start_mean, size, rest, each=True), filled("start_std", start_std, size, rest)
     own_limit = made.spec.max_episode_steps if made.spec else None
     own_period = float(getattr(env, "dt", 1.0 / env.metadata.get("render_fps", 1)))
     mean, std = given if len(start_mean) else starts(name)

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import SIZES, SettingError, within
 from pegasus_jax.config import Config, Search
 
 TRAIN = """\
@@ -137,6 +137,8 @@ def _train(words: Sequence[str]) -> None:
 
     options, rest = settings.split(words, OPTIONS)
     command = shlex.join(["pegasus-train", *words])
+    if empty := [name for name in ("out", "resume") if options.get(name) == ""]:
+        raise SettingError(f"{empty[0]}= names no folder; for example {empty[0]}=runs/demo")
     if "resume" in options:
         if wrong := sorted(key for key in {*rest, *options} - {"resume", *OPTIONS[3:]} if not _changeable(key)):
             raise SettingError(
@@ -326,6 +328,7 @@ def whole(name: str, text: str) -> int:
     """The whole number of an option. Raises SettingError when it is none, or 0 where nothing would be done."""
     if not text.isdecimal() or (name in ("episodes", "seeds", "jobs") and int(text) < 1):
         raise SettingError(f"{name}={text} is not a whole number; for example {name}=20")
+    within(name, int(text), 0, 2**32 - 1 if name == "seed" else SIZES["trials"])
     return int(text)
 
 

@@ -12,9 +12,13 @@ from pegasus_jax import checks
 from pegasus_jax.checks import SettingError
 
 
-def setting(default: Any, text: str) -> Any:
-    """A field with its help text."""
-    return field(default=default, metadata={"help": text})
+def setting(default: Any, text: str, of: tuple[str, ...] = ()) -> Any:
+    """A field with its help text, and where not every task uses it, the names of those that do, maybe with a *."""
+    return field(default=default, metadata={"help": f"of task={'|'.join(of)}: {text}" if of else text, "of": of})
+
+
+GYM, MJCF = ("gym",), ("mjcf",)
+OWN = (*GYM, *MJCF)
 
 
 DROPOUTS = ("log_normal", "binary", "concrete", "gaussian", "sparse", "none")
@@ -49,9 +53,10 @@ class _Network:
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
+        checks.typed("model", self)
         checks.kind("model", self.kind, type(self).kind)
-        checks.within("model.members", self.members, 1)
-        object.__setattr__(self, "hidden", checks.layers("model.hidden", self.hidden))
+        checks.size("model.members", self.members)
+        checks.layers("model.hidden", self.hidden)
         kinds = dict(activation=ACTIVATIONS, dropout=DROPOUTS, head=HEADS, initialiser=INITIALISERS)
         for name, choices in kinds.items():
             checks.choice(f"model.{name}", getattr(self, name), choices)
@@ -86,7 +91,7 @@ class Lagrangian(_Network):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.within("model.substeps", self.substeps, 1)
+        checks.size("model.substeps", self.substeps)
 
 
 @dataclass(frozen=True)
@@ -97,8 +102,9 @@ class GP:
     features: int = setting(200, "sines and cosines in a particle's function, before the data correct it")
 
     def __post_init__(self) -> None:
+        checks.typed("model", self)
         checks.kind("model", self.kind, "gp")
-        checks.within("model.features", self.features, 2)
+        checks.size("model.features", self.features, 2)
         if self.features % 2:
             raise SettingError(f"model.features={self.features} must be even; the nearest is {self.features + 1}")
 
@@ -111,8 +117,9 @@ class SSGP:
     points: int = setting(100, "frequencies of each dimension, a cosine and a sine each")
 
     def __post_init__(self) -> None:
+        checks.typed("model", self)
         checks.kind("model", self.kind, "ssgp")
-        checks.within("model.points", self.points, 1)
+        checks.size("model.points", self.points)
 
 
 @dataclass(frozen=True)
@@ -129,12 +136,12 @@ class MLP:
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
+        checks.typed("policy", self)
         checks.kind("policy", self.kind, "mlp")
-        object.__setattr__(self, "hidden", checks.layers("policy.hidden", self.hidden))
+        checks.layers("policy.hidden", self.hidden)
         for name, choices in (("squash", SQUASHES), ("execution", EXECUTIONS), ("initialiser", INITIALISERS)):
             checks.choice(f"policy.{name}", getattr(self, name), choices)
         checks.within("policy.dropout", self.dropout, 0, 0.99)
-        object.__setattr__(self, "input_units", tuple(self.input_units))
         for name, value in (("output_scale", self.output_scale), *(("input_units", unit) for unit in self.input_units)):
             checks.within(f"policy.{name}", value, 0, open_low=True)
 
@@ -149,8 +156,9 @@ class RBF:
     execution = "mean"  # no setting: there is nothing to sample
 
     def __post_init__(self) -> None:
+        checks.typed("policy", self)
         checks.kind("policy", self.kind, "rbf")
-        checks.within("policy.units", self.units, 1)
+        checks.size("policy.units", self.units)
         checks.choice("policy.squash", self.squash, SQUASHES)
 
 
@@ -163,6 +171,7 @@ class Linear:
     execution = "mean"  # no setting: there is nothing to sample
 
     def __post_init__(self) -> None:
+        checks.typed("policy", self)
         checks.kind("policy", self.kind, "linear")
         checks.choice("policy.squash", self.squash, SQUASHES)
 
@@ -179,9 +188,10 @@ class Fit:
     reset: bool = setting(False, "forget Adam's moments at each trial")
 
     def __post_init__(self) -> None:
+        checks.typed("fit", self)
         checks.kind("fit", self.kind, "adam")
-        checks.within("fit.steps", self.steps, 1)
-        checks.within("fit.batch", self.batch, 1)
+        checks.size("fit.steps", self.steps)
+        checks.size("fit.batch", self.batch)
         checks.within("fit.learning_rate", self.learning_rate, 0, open_low=True)
         checks.within("fit.decay", self.decay, 0, 1)
 
@@ -195,9 +205,10 @@ class LBFGS:
     starts: int = setting(100, "fresh parameters, of which the best, or the current ones, begin")
 
     def __post_init__(self) -> None:
+        checks.typed("fit", self)
         checks.kind("fit", self.kind, "lbfgs")
-        checks.within("fit.steps", self.steps, 1)
-        checks.within("fit.starts", self.starts, 1)
+        checks.size("fit.steps", self.steps)
+        checks.size("fit.starts", self.starts)
 
 
 @dataclass(frozen=True)
@@ -211,6 +222,7 @@ class Period:
     match: int = setting(1, "noise of the moment matching")
 
     def __post_init__(self) -> None:
+        checks.typed("search.period", self)
         for f in dataclasses.fields(self):
             checks.within(f"search.period.{f.name}", getattr(self, f.name), 0)
 
@@ -258,10 +270,13 @@ class Search:
     period: Period = Period()
 
     def __post_init__(self) -> None:
+        checks.typed("search", self)
         checks.kind("search", self.kind, "particles")
         checks.least("search", self, 0, "policy_noise", "state_noise", "cost_noise")
-        checks.least("search", self, 1, "steps", "widen", "anneal", "starts", "loosen")
-        checks.least("search", self, 2, "particles")
+        checks.least("search", self, 1, "widen", "loosen")
+        for name in ("steps", "anneal", "starts"):
+            checks.size(f"search.{name}", getattr(self, name))
+        checks.size("search.particles", self.particles, 2)
         checks.within("search.learning_rate", self.learning_rate, 0, open_low=True)
         checks.within("search.decay", self.decay, 0, 1)
         checks.within("search.reheat", self.reheat, 0, 1)
@@ -310,10 +325,11 @@ class Analytic:
     reset, anneal, sensors = True, 1, "predicted"  # no settings: curvature is that of one model
 
     def __post_init__(self) -> None:
+        checks.typed("search", self)
         checks.kind("search", self.kind, "analytic")
         checks.least("search", self, 0, "policy_noise", "state_noise", "cost_noise")
-        checks.least("search", self, 1, "steps")
-        checks.least("search", self, 2, "particles")
+        checks.size("search.steps", self.steps)
+        checks.size("search.particles", self.particles, 2)
         checks.choice("search.aggregate", self.aggregate, AGGREGATES)
         checks.within("search.discount", self.discount, 0, 1, open_low=True)
 
@@ -326,7 +342,8 @@ class Explore:
     kind: str = setting("uniform", "uniform: a fresh control each step; walk: a random walk")
 
     def __post_init__(self) -> None:
-        checks.within("explore.trials", self.trials, 0)
+        checks.typed("explore", self)
+        checks.size("explore.trials", self.trials, 0)
         checks.choice("explore.kind", self.kind, EXPLORATIONS)
 
 
@@ -338,30 +355,27 @@ class Config:
     """One run."""
 
     task: str = setting("cartpole", "what to learn")
-    legs: int = setting(2, "that a swimmer drives: 2 or 6; the other tasks have none")
-    env: str | None = setting(None, "of task=gym: the environment's Gymnasium id")
-    mjcf: str | None = setting(None, "of task=mjcf: the MuJoCo file, path/to/model.xml")
-    mjcf_digest: str | None = setting(None, "SHA-256 of the compiled mjcf= file; a run notes it, and refuses another")
-    cost: str | None = setting(None, "of task=gym|mjcf: module:function, observation [D] -> cost in [0, 1], in JAX")
-    angles: tuple[int, ...] = setting((), "of task=gym|mjcf: the entries of the observation that are angles [rad]")
-    rates: tuple[int, ...] = setting((), "of task=gym: the entries that are the other entries' rates, in their order")
-    horizon: int | None = setting(None, "of task=gym|mjcf: control periods an episode; null: a gym's own limit, or 100")
+    legs: int = setting(2, "that the swimmer drives: 2 or 6", ("swimmer_*",))
+    env: str | None = setting(None, "the environment's Gymnasium id", GYM)
+    mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", MJCF)
+    mjcf_digest: str | None = setting(None, "SHA-256 of the compiled file; a run notes it, and refuses another", MJCF)
+    cost: str | None = setting(None, "module:function, observation [D] -> cost in [0, 1], in JAX", OWN)
+    angles: tuple[int, ...] = setting((), "the entries of the observation that are angles [rad]", OWN)
+    rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", GYM)
+    horizon: int | None = setting(None, "control periods an episode; null: a gym's own limit, or 100", OWN)
     dt: float | None = setting(
-        None, "of task=gym|mjcf: control period [s]; null: a gym's own. A whole number of an mjcf's time steps"
+        None, "control period [s]; null: a gym's own. A whole number of an mjcf's time steps", OWN
     )
-    observe: tuple[str, ...] = setting((), "of task=mjcf: as [qpos.0,qvel.1]; []: all positions, then all velocities")
-    control_low: tuple[float, ...] = setting(
-        (), "of task=gym|mjcf: least controls; []: the action space's, the file's ctrlrange"
-    )
+    observe: tuple[str, ...] = setting((), "as [qpos.0,qvel.1]; []: all positions, then all velocities", MJCF)
+    control_low: tuple[float, ...] = setting((), "least controls; []: the action space's, the file's ctrlrange", OWN)
     control_high: tuple[float, ...] = setting(
-        (), "of task=gym|mjcf: greatest controls; []: the action space's, the file's ctrlrange"
+        (), "greatest controls; []: the action space's, the file's ctrlrange", OWN
     )
-    start_mean: tuple[float, ...] = setting(
-        (), "of task=gym|mjcf: of the observation; []: of 100 resets, the file's pose at rest"
-    )
+    start_mean: tuple[float, ...] = setting((), "of the observation; []: of 100 resets, the file's pose at rest", OWN)
     start_std: tuple[float, ...] = setting(
-        (0.1,), "of task=gym|mjcf: spread of the starts around start_mean, one for all or one each"
+        (0.1,), "spread of the starts around start_mean, one for all or one each", OWN
     )
+    success: float = setting(0.2, "the mean cost of an episode's last five steps is less than this", OWN)
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
     evaluation: int = setting(20, "episodes after each trial that only measure the policy; 0: none, as for a robot")
@@ -373,16 +387,25 @@ class Config:
     explore: Explore = Explore()
 
     def __post_init__(self) -> None:
+        checks.typed("", self)
         checks.choice("legs", self.legs, LEGS)
         checks.choice("precision", self.precision, PRECISIONS)
-        for name in ("angles", "rates", "observe", "control_low", "control_high", "start_mean", "start_std"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name in ("angles", "rates", "observe"):
+            checks.different(name, getattr(self, name))
+        for name in ("control_low", "control_high", "start_mean"):
+            checks.finite(name, getattr(self, name))
         for deviation in self.start_std:
             checks.within("start_std", deviation, 0)
+        checks.within("success", self.success, 0, open_low=True)
         if self.dt is not None:
-            checks.within("dt", self.dt, 0, open_low=True)
+            checks.within("dt", self.dt, 0, checks.SIZES["dt"], open_low=True)
         if self.horizon is not None:
-            checks.within("horizon", self.horizon, 1)
+            checks.size("horizon", self.horizon)
         checks.within("seed", self.seed, 0, 2**32 - 1)
-        checks.within("trials", self.trials, 1, 10_000)
-        checks.within("evaluation", self.evaluation, 0)
+        checks.size("trials", self.trials)
+        checks.size("evaluation", self.evaluation, 0)
+        if self.trials * (self.horizon or 1) > checks.SIZES["rows"]:
+            raise SettingError(
+                f"trials={self.trials} of horizon={self.horizon} are more than {checks.SIZES['rows']:,} rows of data;"
+                f" the nearest is trials={checks.SIZES['rows'] // (self.horizon or 1)}"
+            )

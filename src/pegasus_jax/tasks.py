@@ -218,7 +218,7 @@ def pinned(config: Config) -> Config:
         return dataclasses.replace(config, **plain)
     if config.task != MJCF or config.mjcf is None:
         return config
-    return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf), mjcf_digest=mjcf.digest(_model(config)))
+    return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf), mjcf_digest=mjcf.digest(_known(config)))
 
 
 def of_guest(config: Config) -> Task:
@@ -249,9 +249,7 @@ def of_mjcf(config: Config) -> Task:
             "task=mjcf needs mjcf=, cost=, dt= and horizon=; for example "
             "mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40"
         )
-    model = _model(config)
-    if config.mjcf_digest not in (None, mjcf.digest(model)):
-        raise SettingError(f"mjcf={config.mjcf} is not what the run began with: its mjcf_digest differs")
+    model = _known(config)
     names = ("observe", "control_low", "control_high", "start_mean", "start_std")
     try:
         plant = mjcf.mechanism(model, config.dt or 0.0, **{name: getattr(config, name) for name in names})
@@ -260,6 +258,14 @@ def of_mjcf(config: Config) -> Task:
     name = Path(config.mjcf or "").stem
     task = _of_users(config, name, plant, plant, config.horizon or 0, plant.state_names, plant.control_names)
     return task._replace(rates=plant.rates)
+
+
+def _known(config: Config) -> Any:
+    """The file's model, if it is the one whose digest the config has, or that has none."""
+    model = _model(config)
+    if config.mjcf_digest not in (None, mjcf.digest(model)):
+        raise SettingError(f"mjcf={config.mjcf} is not what the run began with: its mjcf_digest differs")
+    return model
 
 
 def _model(config: Config) -> Any:
@@ -287,6 +293,7 @@ def _of_users(
         dt=about.dt,
         state_names=states,
         control_names=controls,
+        success=config.success,
     )
 
 
