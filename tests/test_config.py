@@ -6,9 +6,9 @@ import math
 import numpy as np
 import pytest
 
-from pegasus_jax import config
 from pegasus_jax.checks import SettingError, nearest
 from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
+from pegasus_jax.config_models import DROPOUTS
 
 
 def test_a_config_is_a_key():
@@ -133,5 +133,5 @@ def test_limits_themselves_are_possible():
 
 
 def test_the_nearest_choice():
-    assert nearest("lognormal", config.DROPOUTS) == f"did you mean 'log_normal'? choices: {', '.join(config.DROPOUTS)}"
+    assert nearest("lognormal", DROPOUTS) == f"did you mean 'log_normal'? choices: {', '.join(DROPOUTS)}"
     assert nearest("xyz", ("tanh", "sine")) == "choices: tanh, sine"

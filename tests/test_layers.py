@@ -14,7 +14,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
-    0: "types checks config variants",
+    0: "types checks config config_models variants",
     1: "angles mesh quantile dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout"
     " episode calibration user_code",
     2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco cost_check",
@@ -27,6 +27,8 @@ TOP = max(LAYERS)  # the layer that is an application: here modules may import e
 
 # (importer, imported), both of one layer below TOP.
 SIBLINGS: set[tuple[str, str]] = {
+    ("config_models", "checks"),
+    ("config", "config_models"),  # the settings of the models are its
     ("config", "checks"),  # a setting is checked when it is made
     ("variants", "config"),  # a variant is made of settings
     ("dropout", "quantile"),  # uniform draws, and what makes a truncated normal of them

@@ -72,6 +72,22 @@ def size(name: str, value: int, low: int = 1) -> None:
     within(name, value, low, SIZES[name.rpartition(".")[2]])
 
 
+def sizes(section: str, config: Any, *names: str, low: int = 1) -> None:
+    """`size` of each of these settings of a section."""
+    for name in names:
+        size(f"{section}.{name}" if section else name, getattr(config, name), low)
+
+
+def rows(trials: int, horizon: int | None) -> None:
+    """Raises SettingError where episodes make more data than SIZES allows."""
+    most = SIZES["rows"]
+    if trials * (horizon or 1) > most:
+        raise SettingError(
+            f"trials={trials} of horizon={horizon} are more than {most:,} rows of data;"
+            f" the nearest is trials={most // (horizon or 1)}"
+        )
+
+
 def layers(name: str, widths: tuple[int, ...]) -> None:
     """Raises SettingError unless these are widths of hidden layers."""
     for width in widths:
@@ -119,7 +135,7 @@ def _as(kind: Any, value: Any) -> Any:
         parts = [_as(get_args(kind)[0], part) for part in value] if isinstance(value, tuple | list) else [_WRONG]
         return _WRONG if _WRONG in parts else tuple(parts)
     if kind in (int, float):
-        number = numbers.Integral if kind is int else numbers.Real
+        number: Any = numbers.Integral if kind is int else numbers.Real
         return kind(value) if isinstance(value, number) and not isinstance(value, bool) else _WRONG
     return value if isinstance(value, kind) else _WRONG
 
