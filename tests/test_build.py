@@ -21,7 +21,8 @@ from pegasus_jax.build import (
     start,
 )
 from pegasus_jax.checks import SettingError
-from pegasus_jax.config import DROPOUTS, Config, Period
+from pegasus_jax.config import Config, Period
+from pegasus_jax.config_models import DROPOUTS
 from pegasus_jax.dynamics.gp import gp
 from pegasus_jax.dynamics.ssgp import ssgp
 from pegasus_jax.gaussian import affine

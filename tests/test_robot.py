@@ -92,9 +92,9 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_robot_moves_for_the_episodes_that_are_data_and_for_nothing_else(learned: Path) -> None:
-    """A reset and a horizon of steps a trial; going on opens it again, looking at the run does not."""
+    """One reset to check it, a reset and a horizon of steps a trial; going on opens it again, looking at the run not."""
     trial = ["reset", *["step"] * 5]
-    assert asked(learned) == [*trial, *trial, "close"]
+    assert asked(learned) == ["reset", *trial, *trial, "close"]
     rows = record.trials(learned / "run")
     assert [(row["mean_cost"], row["success_rate"]) for row in rows] == [(None, None)] * 2
     assert all(0 <= row["episode_cost"] <= 1 for row in rows)
@@ -133,7 +133,7 @@ def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None
         " resume=run goes on from trial 2",
         err.splitlines()[-1],
     )
-    assert asked(tmp_path) == ["reset", *["step"] * 5, "reset", *["step"] * 3, "close"]
+    assert asked(tmp_path) == ["reset", "reset", *["step"] * 5, "reset", *["step"] * 3, "close"]
     first = record.load_episode(tmp_path / "run", 1)
     assert (first is None, record.load_episode(tmp_path / "run", 2)) == (False, None)
     code, _, err = call("train", "resume=run", cwd=tmp_path)

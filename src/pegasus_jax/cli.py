@@ -1,4 +1,4 @@
-"""The commands: pegasus-train, -eval, -plot, -play, -figures. Each reads `key=value` words and ends with 0, 1 or 2."""
+"""The commands pegasus-train, -check, -eval, -plot, -play, -figures: they read `key=value` words end with 0 to 2."""
 
 import json
 import os
@@ -46,6 +46,19 @@ examples
 
 Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, pegasus-play RUN, or
 tensorboard --logdir RUN/tensorboard.
+"""
+
+CHECK = """\
+pegasus-check task=NAME [setting=value ...]     look at a task before it is learned
+
+Takes the words of pegasus-train, which looks first itself. Opens the environment, resets it once, drives nothing and
+closes it; without start_mean= it is reset more often, as pegasus-train does. Prints spaces, limits, control period,
+start and the cost there, and what its owner should know: a cost above 1, angles that look like degrees, readings that
+never change or follow from others. What cannot be learned is one line, and the exit status 2.
+
+examples
+  pegasus-check task=gym env=robot:Arm-v0 cost=robot:cost angles=[0] start_mean=[3.14,0]
+  pegasus-check task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
 """
 
 EVALUATE = """\
@@ -109,6 +122,11 @@ def train() -> None:
     main(_train, TRAIN)
 
 
+def check() -> None:
+    """Entry point of pegasus-check."""
+    main(_check, CHECK, stopped="nothing was written")
+
+
 def evaluate() -> None:
     """Entry point of pegasus-eval."""
     main(_evaluate, EVALUATE)
@@ -167,7 +185,12 @@ def _train(words: Sequence[str]) -> None:
     from pegasus_jax.build import build
 
     kept = _shelf(config, len(runs))
-    build(replace(config, seed=0), over)  # so that impossible settings end here, before anything is written
+    task = build(replace(config, seed=0), over).task  # so that impossible settings end here, before anything is written
+    if "resume" not in options:
+        from pegasus_jax import check
+
+        for note in check.before_training(config, task, 1 if "start_mean" in rest else check.RESETS):
+            print(f"note: {note}", file=sys.stderr)
     if "resume" not in options and leads():
         if record.seeds_of(home):
             raise SettingError(f"out={home} holds runs already; resume={home} goes on, out={record.free(home)} is free")
@@ -178,6 +201,18 @@ def _train(words: Sequence[str]) -> None:
     train_seeds(config, runs, resume="resume" in options, command=command, mesh=over, shelf=kept)
     if leads():
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
+
+
+def _check(words: Sequence[str]) -> None:
+    from pegasus_jax import settings
+
+    options, rest = settings.split(words, OPTIONS)
+    if "resume" in options:
+        raise SettingError(f"resume={options['resume']} was checked when it began; give the words of a new run")
+    config = settings.parse(rest, options=OPTIONS)
+    from pegasus_jax.check import report
+
+    print("\n".join(report(config)))
 
 
 def _shelf(config: Config, seeds: int) -> Path | None:

@@ -13,7 +13,7 @@ from pegasus_envs import mjcf
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.goals import Task as Manoeuvre
-from pegasus_envs.guest import Facts, facts, guest
+from pegasus_envs.guest import Facts, facts, guest, opened
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
@@ -240,6 +240,46 @@ def _complete(config: Config) -> None:
     if config.env is None or config.cost is None:
         raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
     user_code.load("cost", config.cost)  # from now on modules in the working folder are found, the environment's too
+
+
+def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the greatest observation [D] as far as its environment tells them, else infinite."""
+    if config.task == GYM:
+        space: Any = _environment(config).observation_space
+        return np.asarray(space.low, float), np.asarray(space.high, float)
+    return np.full(len(task.state_names), -np.inf), np.full(len(task.state_names), np.inf)
+
+
+def readings(config: Config, resets: int) -> np.ndarray:
+    """What an environment observes after so many resets [N, D]; N is 0 for a simulation of our own.
+
+    Raises SettingError, in one line, for what the environment raises.
+    """
+    if config.task != GYM:
+        return np.zeros((0, len(config.start_mean)))
+    with user_code.blamed(f"env={config.env} cannot be reset"):
+        found = [np.asarray(_environment(config).reset(seed=seed)[0], float) for seed in range(resets)]
+    return np.stack(found)
+
+
+def described(config: Config) -> dict[str, str]:
+    """What an environment says of itself, by name."""
+    if config.task != GYM:
+        return {"model": config.mjcf} if config.mjcf else {}
+    env: Any = _environment(config)
+    layers = [env]
+    while hasattr(layers[-1], "env"):
+        layers.append(layers[-1].env)
+    spaces = {"observes": env.observation_space, "is driven by": env.action_space}
+    return {
+        "environment": " of ".join(type(layer).__name__ for layer in layers),
+        **{k: str(v) for k, v in spaces.items()},
+    }
+
+
+def _environment(config: Config) -> Any:
+    """The environment of a config, opened once a process and used as its owner made it."""
+    return opened(config.env or "")
 
 
 def of_mjcf(config: Config) -> Task:
