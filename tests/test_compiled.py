@@ -98,7 +98,7 @@ def test_a_disk_that_is_full_keeps_nothing_and_stops_nobody(tmp_path, monkeypatc
     def full(path, write):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(compiled.record, "write_whole", full)
+    monkeypatch.setattr(compiled.files, "write_whole", full)
     assert not doubled(tmp_path / "a")
 
 
@@ -112,8 +112,8 @@ def test_a_shelf_is_that_of_its_settings_seeds_flags_and_sources(cache, monkeypa
     shelves += [compiled.shelf(config, seeds=1)]
     with jax.default_matmul_precision("float32"):
         shelves += [compiled.shelf(config, seeds=1)]
-    known = compiled.record.processor()
-    monkeypatch.setattr(compiled.record, "processor", lambda: {**known, "flags": "others"})
+    known = compiled.machine.processor()
+    monkeypatch.setattr(compiled.machine, "processor", lambda: {**known, "flags": "others"})
     shelves += [compiled.shelf(config, seeds=1)]
     source = tmp_path / "some_plants" / "__init__.py"
     source.parent.mkdir()

@@ -49,9 +49,10 @@ tensorboard --logdir RUN/tensorboard.
 """
 
 EVALUATE = """\
-pegasus-eval RUN [episodes=20] [seed=0] [json=true]     run a learned policy on its plant
+pegasus-eval RUN [trial=last] [episodes=20] [seed=0] [json=true]     run a learned policy on its plant
 
-Uses the newest whole checkpoint of the run, finished or not, and episodes that never become data.
+Uses the policy after trial=N, trial=best or the last trial, and episodes that never become data. mjcf=FILE names the
+model's file where it was moved.
 Prints mean cost per step, success rate (last five steps cost less than .2 on average) and the run's fingerprint:
 SHA-256 over data, model and policy parameters. With json=true, one JSON object.
 """
@@ -66,7 +67,7 @@ bootstrap interval.
 """
 
 PLAY = """\
-pegasus-play RUN [episodes=1] [seed=0]     film a learned policy on its plant
+pegasus-play RUN [trial=last] [episodes=1] [seed=0]     film a learned policy on its plant
 
 Writes RUN/play.mp4: fresh episodes of the newest whole checkpoint of the run, finished or not, in real time,
 20 pictures a second, with cost and command drawn below as they come about. Another seed= gives other starts and
@@ -133,19 +134,23 @@ OPTIONS = ("out", "resume", "seeds", "mesh", "distributed", "coordinator", "proc
 
 
 def _train(words: Sequence[str]) -> None:
-    from pegasus_jax import record, settings, tasks
+    from pegasus_jax import record, restore, settings, tasks
 
     options, rest = settings.split(words, OPTIONS)
     command = shlex.join(["pegasus-train", *words])
     if "resume" in options:
         if wrong := sorted(key for key in {*rest, *options} - {"resume", *OPTIONS[3:]} if not _changeable(key)):
             raise SettingError(
-                f"{wrong[0]} cannot be changed by resume=; only trials=, evaluation=, fit.* and search.* can"
+                f"{wrong[0]} cannot be changed by resume=; only trials=, evaluation=, fit.*, search.* can, and mjcf= if"
+                " the file was moved"
             )
         home = Path(options["resume"])
         runs = record.seeds_of(home)
         first = record.existing(next(iter(runs.values()), home))
-        config = settings.override(settings.load(first / "config.yaml"), settings.values(rest))
+        mjcf = rest.pop("mjcf", None)
+        config = restore.moved(settings.load(first / "config.yaml"), mjcf)
+        config = settings.override(config, settings.values(rest))
+        restore.announce(first, config)
         runs = runs or {config.seed: home}
     else:
         config = tasks.pinned(settings.parse(rest, options=OPTIONS))
@@ -194,7 +199,7 @@ def _shelf(config: Config, seeds: int) -> Path | None:
 
 def _changeable(key: str) -> bool:
     """Whether a run can go on with another value of this setting: what it has learned stays what it is."""
-    return key in ("trials", "evaluation") or key.startswith(("fit.", "search."))
+    return key in ("trials", "evaluation", "mjcf") or key.startswith(("fit.", "search."))
 
 
 def _join(options: dict[str, str]) -> None:
@@ -240,14 +245,15 @@ def _mesh(text: str | None, seeds: int) -> Any:
 
 
 def _evaluate(words: Sequence[str]) -> None:
-    run, rest = _run_and(words, {"episodes": "20", "seed": "0", "json": "false"})
+    run, rest = _run_and(words, {"episodes": "20", "seed": "0", "json": "false", "trial": "last", "mjcf": ""})
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     if rest["json"] not in ("true", "false"):
         raise SettingError(f"json={rest['json']} is neither true nor false")
     from pegasus_jax import settings
     from pegasus_jax.train import evaluate_run
 
-    result = evaluate_run(run, episodes, seed, _shelf(settings.load(run / "config.yaml"), 1))
+    shelf = _shelf(settings.load(run / "config.yaml"), 1)
+    result = evaluate_run(run, episodes, seed, shelf, _trial(rest["trial"]), rest["mjcf"] or None)
     if rest["json"] == "true":
         print(json.dumps(result))
     else:
@@ -256,24 +262,23 @@ def _evaluate(words: Sequence[str]) -> None:
 
 def _plot(words: Sequence[str]) -> None:
     run, _ = _run_and(words, {}, many=True)
-    from pegasus_jax import record, settings, tasks
+    from pegasus_jax import record
     from pegasus_jax.report.curves import seeds_picture
     from pegasus_jax.report.plot import run_pictures
 
     if runs := record.seeds_of(run):
         print(seeds_picture(list(runs.values()), run / "learning.png"))
         return
-    config = settings.load(run / "config.yaml")
-    for path in run_pictures(run, tasks.of_config(config)):
+    for path in run_pictures(run, record.task_of(run)):
         print(path)
 
 
 def _play(words: Sequence[str]) -> None:
-    run, rest = _run_and(words, {"episodes": "1", "seed": "0"})
+    run, rest = _run_and(words, {"episodes": "1", "seed": "0", "trial": "last", "mjcf": ""})
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     from pegasus_jax.report.play import film
 
-    print(film(run, episodes, seed))
+    print(film(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None))
 
 
 def _figures(words: Sequence[str]) -> None:
@@ -329,6 +334,15 @@ def whole(name: str, text: str) -> int:
     return int(text)
 
 
+def _trial(text: str) -> int | str:
+    """The trial whose policy is asked for. Raises SettingError for a text that names none."""
+    if text in ("last", "best"):
+        return text
+    if not text.isdecimal():
+        raise SettingError(f"trial={text} is not a trial; expected a number, best or last")
+    return int(text)
+
+
 HELP = {"-h", "--help", "help"}
 
 
@@ -362,7 +376,7 @@ def main(
 ) -> None:
     """Run a command: 0 done, 1 stopped by its user, 2 a setting or a run's folder that cannot be, in one line."""
     words = sys.argv[1:]
-    from pegasus_jax.record import RunError
+    from pegasus_jax.checks import RunError
 
     try:
         if not words or HELP & {*words}:
@@ -383,6 +397,9 @@ def _remember_compilations() -> None:
     import jax
 
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pegasus_jax"
+        try:
+            cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pegasus_jax"
+        except RuntimeError:  # a user without a home
+            return
         jax.config.update("jax_compilation_cache_dir", str(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

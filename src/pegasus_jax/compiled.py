@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jax.experimental import serialize_executable
 from jax.stages import Compiled, Wrapped
 
-from pegasus_jax import record, settings
+from pegasus_jax import files, machine, settings
 from pegasus_jax.config import Config
 from pegasus_jax.tasks import TASKS
 
@@ -49,11 +49,11 @@ def shelf(config: Config, **shape: Any) -> Path | None:
 
 def surroundings() -> bytes:
     """What one lowered program may become different executables by."""
-    about = {key: value for key, value in record.about("").items() if key != "command"}
+    about = {key: value for key, value in machine.about("").items() if key != "command"}
     config = {
         key: value for key, value in jax.config.values.items() if key != "jax_num_cpu_devices"
     }  # `about` lists them
-    executes = [record.processor().get(name) for name in ("flags", "Features")]  # as x86 and ARM call it
+    executes = [machine.processor().get(name) for name in ("flags", "Features")]  # as x86 and ARM call it
     known = [config, os.environ.get("XLA_FLAGS"), about, executes]
     return json.dumps(known, sort_keys=True, default=str).encode()
 
@@ -106,9 +106,9 @@ def write(path: Path, found: Compiled) -> None:
 def keep(path: Path, content: bytes) -> None:
     """Write a file, and of all the last `KEPT` stay; on a full disk, none is written."""
     try:
-        record.write_whole(path, lambda file: file.write(content))
-        files = sorted(path.parent.iterdir(), key=lambda file: file.stat().st_mtime)
-        for old in files[:-KEPT]:
+        files.write_whole(path, lambda file: file.write(content))
+        kept = sorted(path.parent.iterdir(), key=lambda file: file.stat().st_mtime)
+        for old in kept[:-KEPT]:
             old.unlink()
     except OSError:  # or another process was quicker
         return

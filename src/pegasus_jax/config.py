@@ -341,7 +341,6 @@ class Config:
     legs: int = setting(2, "that a swimmer drives: 2 or 6; the other tasks have none")
     env: str | None = setting(None, "of task=gym: the environment's Gymnasium id")
     mjcf: str | None = setting(None, "of task=mjcf: the MuJoCo file, path/to/model.xml")
-    mjcf_digest: str | None = setting(None, "SHA-256 of the compiled mjcf= file; a run notes it, and refuses another")
     cost: str | None = setting(None, "of task=gym|mjcf: module:function, observation [D] -> cost in [0, 1], in JAX")
     angles: tuple[int, ...] = setting((), "of task=gym|mjcf: the entries of the observation that are angles [rad]")
     rates: tuple[int, ...] = setting((), "of task=gym: the entries that are the other entries' rates, in their order")

@@ -17,7 +17,7 @@ from jax.sharding import Mesh, NamedSharding
 
 from pegasus_jax import mesh
 from pegasus_jax.compiled import program
-from pegasus_jax.record import processors
+from pegasus_jax.machine import processors
 from pegasus_jax.types import Experiment
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")

@@ -16,8 +16,8 @@ from pegasus_jax import mesh, settings
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
+from pegasus_jax.files import write_whole
 from pegasus_jax.program import LASTING, compiler_options, described
-from pegasus_jax.record import write_whole
 from pegasus_jax.tasks import GYM
 from pegasus_jax.train import saturated, succeeded
 from pegasus_jax.trial import TrialInfo, trial

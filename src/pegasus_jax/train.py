@@ -15,16 +15,15 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 from tensorboardX import SummaryWriter
 
-from pegasus_jax import checkpoint, record, settings
+from pegasus_jax import checkpoint, record, restore, settings
 from pegasus_jax.build import build, set_precision
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import RunError, SettingError
 from pegasus_jax.config import Config
 from pegasus_jax.dataset import grow
 from pegasus_jax.program import Program, fetched, leads
 from pegasus_jax.progress import Display
-from pegasus_jax.record import RunError
 from pegasus_jax.trial import COLLECT, EVALUATE, trial_key
-from pegasus_jax.types import Experiment, Key, Learner, Params, RunState, Task, Trajectory
+from pegasus_jax.types import Experiment, Key, Params, RunState, Task, Trajectory
 
 # What `improved` says of a trial that has not improved anything.
 UNKNOWN: dict[str, Any] = {
@@ -66,23 +65,28 @@ def train_seeds(
     folders, seeds = list(runs.values()), list(runs)
     with ExitStack() as held:
         for run in folders if leads() else ():
-            held.enter_context(record.lock(run))
+            held.enter_context(record.lock(run, new=not resume))
+            record.remove_unfinished(run)
         before = settings.load(folders[0] / "config.yaml") if resume else config
         if config.trials < before.trials:
             raise SettingError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
         set_precision(config)
         experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
+        for run in folders if resume else ():
+            restore.same(run, experiment.task)
         program = Program(experiment, config.search.steps, len(seeds), mesh, shelf=shelf)
         display = Display(config.trials, 0, quiet=not leads())
-        states = together(folders, replace(before, seed=0), display) if resume else None
+        states = restore.together(folders, experiment, display.line) if resume else None
         done = display.done = 0 if states is None else int(states.trial[0])
         if done < config.trials:
             program.prepare("search")
         keys = jnp.stack([jax.random.key(seed) for seed in seeds])
         if states is None:
             states = program("init", keys)
-        elif (config.fit, config.search) != (before.fit, before.search):
-            states = suited(states, program("init", keys))
+        elif (config.fit, config.search) != (before.fit, before.search) or any(
+            learner.optimizer is None for learner in (states.model, states.policy)
+        ):
+            states = restore.suited(states, program("init", keys))
         room = config.trials * experiment.task.horizon
         if room > states.data.x.shape[1]:
             states = states._replace(data=jax.vmap(partial(grow, capacity=room))(states.data))
@@ -90,8 +94,8 @@ def train_seeds(
         boards = []
         for seed, run in runs.items() if leads() else ():
             settings.save(replace(config, seed=seed), run / "config.yaml")
-            record.note(run, command, done)
-            record.write_trials(run, record.trials(run)[:done])
+            record.note(run, command, done, experiment.task)
+            record.write_trials(run, record.readable_trials(run)[0][:done])
             boards.append(held.enter_context(SummaryWriter(str(run / "tensorboard"), purge_step=done + 1)))
         with display.running():
             for trial in range(done + 1, config.trials + 1):
@@ -135,7 +139,7 @@ def one_trial(
             "trial": trial,
             "plant_seconds": round(trial * task.horizon * task.dt, 6),
             "random": trial <= config.explore.trials,
-            "episode_cost": float(np.mean(episode.cost)),
+            "episode_cost": restore.mean_cost(episode.cost),
             **evaluation[index],
             **found[index],
             "saturated": float(saturated(episode.u, task)),
@@ -192,7 +196,8 @@ def collected(
             if episodes[index] is None:
                 episodes[index] = part(fresh, index)
                 if leads():
-                    record.save_episode(run, trial, part(fresh, index), task)
+                    policy = 0 if trial <= config.explore.trials else trial - 1
+                    record.save_episode(run, trial, part(fresh, index), task, policy=policy, ended="horizon")
     return [episode for episode in episodes if episode is not None]
 
 
@@ -255,50 +260,21 @@ def part(tree: Any, index: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def together(runs: Sequence[Path], config: Config, display: Display) -> RunState | None:
-    """The states [S, ...] of the newest trial of which every run has a whole checkpoint, or None."""
-    shared = set.intersection(*(set(checkpoint.available(run)) for run in runs))
-    for trial in sorted(shared, reverse=True):
-        problems = [problem for run in runs if (problem := checkpoint.damage(run, trial)) is not None]
-        if not problems:
-            like = jax.eval_shape(build(config).init, jax.random.key(0))
-            try:
-                states = [checkpoint.restore(run, trial, like) for run in runs]
-            except RunError as error:
-                problems = [str(error)]
-            else:
-                return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-        for problem in problems:
-            display.line(f"checkpoint {trial} is not usable: {problem}; going on from the one before it")
-    return None
+def evaluate_run(
+    run: Path,
+    episodes: int,
+    seed: int,
+    shelf: Path | None = None,
+    trial: restore.Trial = restore.LAST,
+    mjcf: str | None = None,
+) -> dict[str, Any]:
+    """How the policy of a trial does on its plant, and the run's fingerprint then. `shelf` is as for `Program`.
 
-
-def suited(states: RunState, fresh: RunState) -> RunState:
-    """The states, with fresh optimisers where the settings ask for others than the run had so far."""
-
-    def shape(tree: Any) -> tuple[Any, list[Any]]:
-        return jax.tree.structure(tree), jax.tree.map(jnp.shape, jax.tree.leaves(tree))
-
-    def learner(old: Learner, new: Learner) -> Learner:
-        same = shape(old.optimizer) == shape(new.optimizer)
-        return old if same else old._replace(optimizer=new.optimizer)
-
-    return states._replace(model=learner(states.model, fresh.model), policy=learner(states.policy, fresh.policy))
-
-
-def newest(run: Path) -> tuple[Config, Experiment, RunState]:
-    """A run's config, its experiment and its newest whole state. Raises RunError when there is none yet."""
-    config = settings.load(run / "config.yaml")
+    `mjcf` is where the model's file is now, if it is not where it was.
+    """
+    config = restore.moved(settings.load(record.existing(run) / "config.yaml"), mjcf)
     set_precision(config)
-    states = together([run], config, Display(config.trials, 0))
-    if states is None:
-        raise RunError(f"{run} has no checkpoint that this version can use yet; resume={run} makes one")
-    return config, build(config), part(states, 0)
-
-
-def evaluate_run(run: Path, episodes: int, seed: int, shelf: Path | None = None) -> dict[str, Any]:
-    """How the newest policy of a run does on its plant, and the run's fingerprint. `shelf` is as for `Program`."""
-    _, experiment, state = newest(run)
+    _, experiment, state = restore.restored(run, trial, restore.planted(run, config))
     program = Program(experiment, 1, shelf=shelf)
     params = jax.tree.map(lambda leaf: leaf[None], state.policy.params)
     keys = jax.random.key(seed)[None]

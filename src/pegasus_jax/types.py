@@ -38,6 +38,7 @@ class Trajectory(NamedTuple):
     x: Array  # [H+1, D] observed state
     u: Array  # [H, U] control
     cost: Array  # [H] cost of the states 1..H, without sensor noise where the plant can tell
+    length: Array | None = None  # [] int32, how many control periods it lasted; the rows after them are not known
 
 
 class Prediction(NamedTuple):
