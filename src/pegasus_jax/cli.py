@@ -9,8 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pegasus_jax import cache
 from pegasus_jax.checks import SettingError
-from pegasus_jax.config import Config, Search
+from pegasus_jax.config import Search
 
 TRAIN = """\
 pegasus-train task=NAME [setting=value ...]     learn a controller
@@ -169,7 +170,6 @@ def _train(words: Sequence[str]) -> None:
     over = _mesh(options.get("mesh"), len(runs))
     from pegasus_jax.build import build
 
-    kept = _shelf(config, len(runs))
     build(replace(config, seed=0), over)  # so that impossible settings end here, before anything is written
     if "resume" not in options and leads():
         if record.seeds_of(home):
@@ -178,23 +178,9 @@ def _train(words: Sequence[str]) -> None:
             record.create(run)
     from pegasus_jax.train import train_seeds
 
-    train_seeds(config, runs, resume="resume" in options, command=command, mesh=over, shelf=kept)
+    train_seeds(config, runs, resume="resume" in options, command=command, mesh=over)
     if leads():
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
-
-
-def _shelf(config: Config, seeds: int) -> Path | None:
-    """Where the programs of a config for so many seeds are kept; then JAX's own cache is switched off."""
-    import jax
-
-    from pegasus_jax.build import set_precision
-    from pegasus_jax.compiled import shelf
-
-    set_precision(config)
-    kept = shelf(replace(config, seed=0), seeds=seeds)
-    if kept is not None:
-        jax.config.update("jax_enable_compilation_cache", False)
-    return kept
 
 
 def _changeable(key: str) -> bool:
@@ -249,11 +235,9 @@ def _evaluate(words: Sequence[str]) -> None:
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     if rest["json"] not in ("true", "false"):
         raise SettingError(f"json={rest['json']} is neither true nor false")
-    from pegasus_jax import settings
     from pegasus_jax.train import evaluate_run
 
-    shelf = _shelf(settings.load(run / "config.yaml"), 1)
-    result = evaluate_run(run, episodes, seed, shelf, _trial(rest["trial"]), rest["mjcf"] or None)
+    result = evaluate_run(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None)
     if rest["json"] == "true":
         print(json.dumps(result))
     else:
@@ -393,13 +377,16 @@ def main(
 
 
 def _remember_compilations() -> None:
-    """Keep compiled programs in the user's cache folder, unless JAX was told where already."""
+    """Keep compiled programs in the user's cache folder, unless JAX was told where already; in none that is unsafe."""
     import jax
 
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        try:
-            cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pegasus_jax"
-        except RuntimeError:  # a user without a home
-            return
-        jax.config.update("jax_compilation_cache_dir", str(cache))
+    told = "JAX_COMPILATION_CACHE_DIR" in os.environ
+    folder = os.environ["JAX_COMPILATION_CACHE_DIR"] if told else cache.folder()
+    if not folder or "://" in folder:
+        return
+    if problem := cache.problem(Path(folder)):
+        print(f"{folder} {problem}; programs are compiled as if for the first time", file=sys.stderr)
+        jax.config.update("jax_compilation_cache_dir", None)
+    elif not told:
+        jax.config.update("jax_compilation_cache_dir", folder)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache, partial
 from importlib.metadata import entry_points
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -16,7 +15,6 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
 from pegasus_jax import mesh
-from pegasus_jax.compiled import program
 from pegasus_jax.machine import processors
 from pegasus_jax.types import Experiment
 
@@ -48,10 +46,9 @@ FEW = 128  # particles that one thread of a processor imagines as fast as two
 class Jitted:
     """A jitted function that says how long its caller waited for compiling; compiles once, or it is a defect."""
 
-    def __init__(self, function: Callable[..., Any], kept: Path | None = None, **options: Any) -> None:
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
         self.coming: Future | None = None
-        self.kept, self.options = kept, options  # where it is on disk, and how it was made
 
     def __call__(self, *arguments: Any) -> Any:
         if self.compiled is None:
@@ -61,17 +58,14 @@ class Jitted:
         return jax.block_until_ready(self.compiled(*arguments))
 
     def compile(self, *arguments: Any) -> Any:
-        """The function compiled for arguments of these shapes, now or by an earlier command."""
-        if self.kept is not None:
-            return program(self.kept, self.function, arguments, self.options)
+        """The function compiled for arguments of these shapes."""
         return self.function.lower(*arguments).compile()
 
 
 class Program:
     """An experiment over S seeds: every argument and result has a leading axis [S], except those that all share.
 
-    With a mesh, the seeds lie on its devices; those of several processes call every part together. With a `shelf`,
-    which is this experiment's alone (`compiled.shelf`), its programs are kept there.
+    With a mesh, the seeds lie on its devices; those of several processes call every part together.
     """
 
     def __init__(
@@ -81,7 +75,6 @@ class Program:
         seeds: int = 1,
         over: Mesh | None = None,
         side_by_side: bool | None = None,
-        shelf: Path | None = None,
     ) -> None:
         self.mesh, self.seeds = over, seeds
         # Evaluation episodes. A GPU takes as long for one as for twenty; a processor does not, and would have one
@@ -105,7 +98,6 @@ class Program:
         self.parts = {
             name: Jitted(
                 over_seeds(function, axes, seeds=seeds, over=over),
-                kept=shelf and shelf.with_name(f"{shelf.name}-{name}{self.chunk if name == 'search' else ''}"),
                 compiler_options=compiler_options(LASTING if name in LONG else BRIEFLY),
                 **layout,
             )

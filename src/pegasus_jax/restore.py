@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import checkpoint, facts, record, settings, tasks
-from pegasus_jax.build import compose
+from pegasus_jax.build import compose, set_precision
 from pegasus_jax.checks import RunError, SettingError
 from pegasus_jax.config import Config
 from pegasus_jax.types import Experiment, Learner, RunState, Task
@@ -38,6 +38,16 @@ def restored(run: Path, trial: Trial = LAST, task: Task | None = None) -> tuple[
         experiment = compose(config, task or record.task_of(run))
         like = jax.eval_shape(experiment.init, jax.random.key(0))
         return config, experiment, _state(run, trial, like)
+
+
+def ready(run: Path, trial: Trial = LAST, mjcf: str | None = None) -> tuple[Config, Experiment, RunState]:
+    """`restored`, with the plant and the cost, for a command that runs episodes: the run's precision is JAX's then.
+
+    `mjcf` is where the model's file is now, if it is not where it was.
+    """
+    config = moved(settings.load(record.existing(run) / "config.yaml"), mjcf)
+    set_precision(config)
+    return restored(run, trial, planted(run, config))
 
 
 def _state(run: Path, trial: Trial, like: RunState) -> RunState:

@@ -53,14 +53,13 @@ def train_seeds(
     resume: bool = False,
     command: str = "",
     mesh: Mesh | None = None,
-    shelf: Path | None = None,
 ) -> RunState:
     """`train` for the seeds and folders of `runs`, all as one program; returns their states [S, ...].
 
     Each folder is what a run of that seed alone would leave, and can be resumed alone. The seeds share nothing but the
     clock: one that diverges leaves the others as they are. All go on from the newest trial that all have finished.
     With a `mesh` (mesh.py) of several devices the seeds are shared out among them; where several processes hold the
-    devices, all call this together, see the same files, and the first one writes. `shelf` is as for `Program`.
+    devices, all call this together, see the same files, and the first one writes.
     """
     folders, seeds = list(runs.values()), list(runs)
     with ExitStack() as held:
@@ -74,7 +73,7 @@ def train_seeds(
         experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
         for run in folders if resume else ():
             restore.same(run, experiment.task)
-        program = Program(experiment, config.search.steps, len(seeds), mesh, shelf=shelf)
+        program = Program(experiment, config.search.steps, len(seeds), mesh)
         display = Display(config.trials, 0, quiet=not leads())
         states = restore.together(folders, experiment, display.line) if resume else None
         done = display.done = 0 if states is None else int(states.trial[0])
@@ -264,18 +263,15 @@ def evaluate_run(
     run: Path,
     episodes: int,
     seed: int,
-    shelf: Path | None = None,
     trial: restore.Trial = restore.LAST,
     mjcf: str | None = None,
 ) -> dict[str, Any]:
-    """How the policy of a trial does on its plant, and the run's fingerprint then. `shelf` is as for `Program`.
+    """How the policy of a trial does on its plant, and the run's fingerprint then.
 
     `mjcf` is where the model's file is now, if it is not where it was.
     """
-    config = restore.moved(settings.load(record.existing(run) / "config.yaml"), mjcf)
-    set_precision(config)
-    _, experiment, state = restore.restored(run, trial, restore.planted(run, config))
-    program = Program(experiment, 1, shelf=shelf)
+    _, experiment, state = restore.ready(run, trial, mjcf)
+    program = Program(experiment, 1)
     params = jax.tree.map(lambda leaf: leaf[None], state.policy.params)
     keys = jax.random.key(seed)[None]
     with on_plant(experiment.task):

@@ -14,10 +14,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from pegasus_jax import episode, restore, settings, tasks
-from pegasus_jax.build import set_precision
+from pegasus_jax import episode, restore, tasks
 from pegasus_jax.checks import RunError
-from pegasus_jax.files import beside
 from pegasus_jax.types import Array, Key, Params, Policy, Task, Trajectory
 
 WIDTH, HEIGHT, STRIP = 640, 480, 192  # [pixels], multiples of the 16 of a video's blocks
@@ -39,15 +37,12 @@ class Strip(NamedTuple):
 
 def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.LAST, mjcf: str | None = None) -> Path:
     """Write RUN/play.mp4: `episodes` episodes that are not data, one after the other, in real time."""
-    config = restore.moved(settings.load(run / "config.yaml"), mjcf)
-    set_precision(config)
-    config, experiment, state = restore.restored(run, trial, restore.planted(run, config))
+    config, experiment, state = restore.ready(run, trial, mjcf)
     task, mean = experiment.task, config.policy.execution == "mean"
     if not hasattr(task.plant, "glide"):
         raise RunError(f"{run} learned {task.name}; only plants in JAX can be filmed")
     perform = jax.jit(partial(performance, task=task, policy=experiment.policy, mean=mean))
-    path = run / "play.mp4"
-    unfinished = Path(f"{beside(path)}.mp4")
+    path, beside = run / "play.mp4", run / ".play.mp4"
     writer: Any = None
     try:
         for number, key in enumerate(jax.random.split(jax.random.key(seed), episodes), start=1):
@@ -56,15 +51,15 @@ def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.LAS
             pictures = _pictures(task, states)
             if writer is None:
                 rate = round(len(pictures) / (task.horizon * task.dt))
-                writer = imageio.get_writer(unfinished, fps=rate, macro_block_size=16)
+                writer = imageio.get_writer(beside, fps=rate, macro_block_size=16)
             for picture in composed(pictures, strip(trajectory, task, title)):
                 writer.append_data(picture)
         writer.close()
-        os.replace(unfinished, path)
+        os.replace(beside, path)
     finally:
         if writer is not None:
             writer.close()
-        unfinished.unlink(missing_ok=True)
+        beside.unlink(missing_ok=True)
     return path
 
 
