@@ -32,10 +32,10 @@ def row(trial: int, **known: Any) -> dict[str, Any]:
     return {"trial": trial, "episode_cost": 1 - trial / 10, **numbers, **policy, **known}
 
 
-def a_run(run: Path, trials: int = 3, task: Task | None = None, **changes: str) -> Path:
+def a_run(run: Path, trials: int = 3, made: Task | None = None, **changes: str) -> Path:
     """The folder of a run of so many trials, each with an episode, a row and a checkpoint."""
     config = settings.parse(TINY | {"trials": str(trials)} | {k.replace("__", "."): v for k, v in changes.items()})
-    task = task or tasks.make(config.task)
+    task = made or tasks.make(config.task)
     record.create(run)
     settings.save(config, run / "config.yaml")
     record.note(run, "pegasus-train", 0, task)

@@ -32,8 +32,8 @@ FILES = ("config.yaml", "run.json", "trials.jsonl", ".lock")
 FOLDERS = ("episodes", "imagined", "checkpoints", "tensorboard", "plots")
 # What a killed process was writing (files.beside), and orbax.
 UNFINISHED = re.compile(
-    r"\.(\d{4,}\.(npz|json)|trials\.jsonl|run\.json|config\.yaml|learning\.png|trial_\d{4,}\.png|play\.mp4)"
-    r"\.\w{8}(\.mp4)?|\d{4,}\.orbax-checkpoint-tmp.*"
+    r"\.(\d{4,}\.(npz|json)|trials\.jsonl|run\.json|config\.yaml|learning\.png|trial_\d{4,}\.png)"
+    r"\.\w{8}|\.play\.\w{8}|\d{4,}\.orbax-checkpoint-tmp.*"
 )
 ENDED = ("horizon", "terminated", "truncated", "error", "interrupted")  # how an episode can end
 CUT = ("error", "interrupted")  # of these, by what is no doing of the policy
@@ -276,7 +276,7 @@ def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None =
         return max(rows, key=lambda row: (row["success_rate"], -row["mean_cost"], row["trial"]))["trial"]
     costs: dict[int, list[float]] = {}
     for row in [*rows, *([last_episode] if last_episode else [])]:
-        policy = row.get("policy", 0 if row.get("random") else row["trial"] - 1)
+        policy = row["policy"] if "policy" in row else 0 if row.get("random") else row["trial"] - 1
         if policy and row["episode_cost"] is not None and row.get("ended", "horizon") not in CUT:
             costs.setdefault(policy, []).append(row["episode_cost"])
     if not costs:

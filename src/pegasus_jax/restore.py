@@ -206,9 +206,9 @@ def announce(run: Path, config: Config) -> None:
 def _files(module: str) -> list[Path]:
     """The files that an import of a module runs, found without running one: those of its packages, then its own."""
     path: Sequence[str] | None = [*sys.path, os.getcwd()]
-    found, parts = [], module.split(".")
-    for count in range(1, len(parts) + 1):
-        spec = PathFinder.find_spec(".".join(parts[:count]), path)
+    found = []
+    for part in module.split("."):
+        spec = PathFinder.find_spec(part, path)
         if spec is None:
             break
         found += [Path(spec.origin)] if spec.origin else []
