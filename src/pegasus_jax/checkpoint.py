@@ -1,4 +1,4 @@
-"""RunState on disk: orbax writes the arrays, a SHA-256 list beside them tells a damaged checkpoint from a whole one."""
+"""RunState on disk: its arrays by name, and a list of SHA-256 that tells a damaged checkpoint from a whole one."""
 
 import hashlib
 import json
@@ -12,9 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax.checks import RunError
-from pegasus_jax.files import write_json
-from pegasus_jax.record import numbered
+from pegasus_jax.files import write_json, write_whole
+from pegasus_jax.record import arrays, numbered
 from pegasus_jax.types import Key, RunState
+
+STATE = "state.npz"
 
 
 def save(run: Path, trial: int, state: RunState) -> None:
@@ -22,8 +24,8 @@ def save(run: Path, trial: int, state: RunState) -> None:
     path = _folder(run, trial)
     _sums(run, trial).unlink(missing_ok=True)
     shutil.rmtree(path, ignore_errors=True)
-    with _checkpointer() as checkpointer:
-        checkpointer.save(path, jax.tree.map(np.asarray, _plain(state)))  # of the host: any devices can read it back
+    leaves = {name: np.asarray(leaf) for name, leaf in _named(_plain(state)).items()}
+    write_whole(path / STATE, lambda file: np.savez(file, **leaves))  # type: ignore[arg-type]
     write_json(_sums(run, trial), {str(f.relative_to(path)): _digest(f) for f in _files(path)})
 
 
@@ -57,11 +59,7 @@ def restore(run: Path, trial: int, like: RunState) -> RunState:
     RunError, naming the difference, when the rest is the state of another experiment or version.
     """
     folder, like = _folder(run, trial), jax.eval_shape(_plain, like)
-    try:
-        with _checkpointer() as checkpointer:
-            stored = _named(checkpointer.restore(folder))
-    except (ValueError, KeyError, TypeError) as error:
-        raise RunError(f"{folder} is of another version or of other settings") from error
+    stored = arrays(folder / STATE)
     optimizers = {"model": like.model.optimizer, "policy": like.policy.optimizer}
     rest = like._replace(model=like.model._replace(optimizer=None), policy=like.policy._replace(optimizer=None))
     if difference := _difference(stored, _named(rest)):
@@ -120,17 +118,6 @@ def fingerprint(state: RunState) -> str:
     return digest.hexdigest()
 
 
-def _checkpointer() -> Any:
-    """One that waits for no other process: each reads for itself, and one alone writes."""
-    import orbax.checkpoint as ocp  # here: it takes .2 s, and a run needs it after its first trial
-
-    own = jax.process_index()
-    alone = ocp.options.MultiprocessingOptions(
-        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
-    )
-    return ocp.StandardCheckpointer(multiprocessing_options=alone)
-
-
 def _plain(state: RunState) -> RunState:
     """The state with its typed key as the raw words that files can hold."""
     key: Key = state.key
@@ -138,7 +125,7 @@ def _plain(state: RunState) -> RunState:
 
 
 def _folder(run: Path, trial: int) -> Path:
-    return run.absolute() / "checkpoints" / f"{trial:04d}"
+    return run / "checkpoints" / f"{trial:04d}"
 
 
 def _sums(run: Path, trial: int) -> Path:

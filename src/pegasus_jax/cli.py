@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pegasus_jax import cache
+from pegasus_jax import cache, files
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Search
 
@@ -370,6 +370,9 @@ def main(
         command(words)
     except (SettingError, RunError) as error:
         print(f"pegasus: {error}", file=sys.stderr)
+        sys.exit(2)
+    except OSError as error:
+        print(f"pegasus: {files.refused(error)}; {stopped}", file=sys.stderr)
         sys.exit(2)
     except KeyboardInterrupt:
         print(f"stopped; {stopped}", file=sys.stderr)

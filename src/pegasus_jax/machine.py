@@ -18,7 +18,7 @@ def processors() -> int:
 
 def about(command: str) -> dict[str, Any]:
     """Versions, machine and command: what somebody else needs to repeat the run."""
-    packages = ("pegasus-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
+    packages = ("pegasus-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
     versions = {}
     for name in packages:
         try:

@@ -6,7 +6,7 @@
                              ran, names, dt; written before anything else happens to it
         imagined/0001.npz    particles after trial 1: x [H+1, K, D], u [H, K, U], cost [H, K]
         trials.jsonl         one JSON object a trial
-        checkpoints/0001/    orbax, with 0001.json: the SHA-256 of each of its files
+        checkpoints/0001/    the state after trial 1, with 0001.json: the SHA-256 of each of its files
         tensorboard/         the numbers of trials.jsonl as scalars
 
 Files appear whole or not at all: written beside their place, flushed to disk, then renamed.
@@ -30,10 +30,10 @@ from pegasus_jax.types import Rollout, Task, Trajectory
 
 FILES = ("config.yaml", "run.json", "trials.jsonl", ".lock")
 FOLDERS = ("episodes", "imagined", "checkpoints", "tensorboard", "plots")
-# What a killed process was writing (files.beside), and orbax.
+# What a killed process was writing (files.beside), and pegasus-play.
 UNFINISHED = re.compile(
-    r"\.(\d{4,}\.(npz|json)|trials\.jsonl|run\.json|config\.yaml|learning\.png|trial_\d{4,}\.png)"
-    r"\.\w{8}|\.play\.\w{8}|\d{4,}\.orbax-checkpoint-tmp.*"
+    r"\.(\d{4,}\.(npz|json)|state\.npz|trials\.jsonl|run\.json|config\.yaml|learning\.png|trial_\d{4,}\.png)"
+    r"\.\w{8}|\.play\.\w{8}"
 )
 ENDED = ("horizon", "terminated", "truncated", "error", "interrupted")  # how an episode can end
 CUT = ("error", "interrupted")  # of these, by what is no doing of the policy
@@ -113,7 +113,7 @@ def lock(path: Path, *, new: bool = False) -> FileLock:
 
 def remove_unfinished(run: Path) -> None:
     """Remove the files that killed processes were writing. Only who holds the lock may do that."""
-    for folder in (run, *(run / name for name in FOLDERS)):
+    for folder in (run, *(run / name for name in FOLDERS), *run.glob("checkpoints/[0-9]*")):
         for path in list(folder.iterdir()) if folder.is_dir() else ():
             if UNFINISHED.fullmatch(path.name):
                 shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)
@@ -164,7 +164,7 @@ def _episode(run: Path, trial: int) -> dict[str, np.ndarray] | None:
     path = episode_path(run, trial)
     if not path.exists():
         return None
-    found = _arrays(path, "x", "u", "cost", "task", "trial", "policy", "ended", "horizon")
+    found = arrays(path, "x", "u", "cost", "task", "trial", "policy", "ended", "horizon")
     if wrong := _wrong(found, trial, task_of(run)):
         raise RunError(f"{path} {wrong}")
     return found
@@ -208,7 +208,7 @@ def load_imagined(run: Path, trial: int) -> dict[str, np.ndarray] | None:
     path = run / "imagined" / f"{trial:04d}.npz"
     if not path.exists():
         return None
-    found, task = _arrays(path, "x", "u", "cost"), task_of(run)
+    found, task = arrays(path, "x", "u", "cost"), task_of(run)
     steps, particles = found["cost"].shape if found["cost"].ndim == 2 else (0, 0)
     shapes = ((steps + 1, particles, len(task.state_names)), (steps, particles, len(task.control_names)))
     if not steps or (found["x"].shape, found["u"].shape) != shapes or found["x"].dtype.kind != "f":
@@ -216,7 +216,7 @@ def load_imagined(run: Path, trial: int) -> dict[str, np.ndarray] | None:
     return found
 
 
-def _arrays(path: Path, *names: str) -> dict[str, np.ndarray]:
+def arrays(path: Path, *names: str) -> dict[str, np.ndarray]:
     """The arrays of an .npz file. Raises RunError unless it can be read, whole, and has these."""
     try:
         with np.load(path, allow_pickle=False) as file:

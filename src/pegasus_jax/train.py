@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
-from tensorboardX import SummaryWriter
 
 from pegasus_jax import checkpoint, record, restore, settings
+from pegasus_jax.board import Board
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.checks import RunError, SettingError
 from pegasus_jax.config import Config
@@ -95,7 +95,7 @@ def train_seeds(
             settings.save(replace(config, seed=seed), run / "config.yaml")
             record.note(run, command, done, experiment.task)
             record.write_trials(run, record.readable_trials(run)[0][:done])
-            boards.append(held.enter_context(SummaryWriter(str(run / "tensorboard"), purge_step=done + 1)))
+            boards.append(Board(run / "tensorboard", done + 1, display.line))
         with display.running():
             for trial in range(done + 1, config.trials + 1):
                 with on_plant(experiment.task, f"; resume={folders[0]} goes on from trial {trial}"):
@@ -103,7 +103,7 @@ def train_seeds(
                 whole = fetched(states)
                 for index, board in enumerate(boards):
                     record.write_trials(folders[index], [*record.trials(folders[index]), rows[index]])
-                    scalars(board, rows[index])
+                    board.add(rows[index])
                     checkpoint.save(folders[index], trial, part(whole, index))
                 display.line(summary(rows, config.trials))
     return states
@@ -277,13 +277,6 @@ def evaluate_run(
     with on_plant(experiment.task):
         (result,) = evaluate(keys, params, experiment.task, program, episodes)
     return {"trial": int(state.trial), "episodes": episodes, **result, "fingerprint": checkpoint.fingerprint(state)}
-
-
-def scalars(board: SummaryWriter, row: dict[str, Any]) -> None:
-    """The numbers of a trial's row as TensorBoard scalars."""
-    for name, value in {**row, **{f"seconds/{k}": v for k, v in row["seconds"].items()}}.items():
-        if isinstance(value, int | float):
-            board.add_scalar(name, value, row["trial"])
 
 
 def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
