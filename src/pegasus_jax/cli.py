@@ -177,8 +177,8 @@ def _train(words: Sequence[str]) -> None:
     if options.get("final", "false") not in ("true", "false"):
         raise SettingError(f"final={options['final']} is neither true nor false")
     done = len(record.trials(first)) if "resume" in options else None
-    print(progress.announcement(config, home, len(runs), done), flush=True)
     _begun.append(home)
+    print(progress.announcement(config, home, len(runs), done), flush=True)
     _join(options)
     from pegasus_jax.program import leads, share_processors
 
@@ -389,7 +389,7 @@ def _help(text: str, words: Sequence[str]) -> str:
 def main(
     command: Callable[[Sequence[str]], None],
     text: str,
-    stopped: str = "every finished episode is kept, resume=RUN goes on",
+    stopped: str = "nothing was learned",
 ) -> None:
     """Run a command: 0 done, 2 a setting or a run's folder that cannot be, in one line, 130 after Ctrl-C.
 
