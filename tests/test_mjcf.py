@@ -139,6 +139,8 @@ def test_folders_tell_tasks_apart() -> None:
         ({"observe": ("tip",)}, "choose from qpos.0"),
         ({"control_low": (1.0, 2.0)}, "control_low has 2 entries; expected 1"),
         ({"control_low": (5.0,)}, "control_low=5 must be less than control_high=3"),
+        ({"dt": 2000.0}, "dt=2000 is 100000 of its time steps; the most is dt=200"),
+        ({"start_mean": (0.1,)}, "start_mean has 1 entries; expected 4"),
         ({"start_mean": (1.0, 2.0)}, "start_mean has 2 entries; expected 4"),
         ({"angles": (4,)}, "choose from 0 to 3"),
         ({"cost": "math:nothing"}, "cost=math:nothing cannot be imported"),

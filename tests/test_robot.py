@@ -90,9 +90,9 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_robot_moves_for_the_episodes_that_are_data_and_for_nothing_else(learned: Path) -> None:
-    """A reset and a horizon of steps a trial; going on opens it again, looking at the run does not."""
+    """One reset to check it, a reset and a horizon of steps a trial; looking at the run does not even open it."""
     trial = ["reset", *["step"] * 5]
-    assert asked(learned) == [*trial, *trial, "close"]
+    assert asked(learned) == ["reset", *trial, *trial, "close"]
     rows = record.trials(learned / "run")
     assert [(row["mean_cost"], row["success_rate"]) for row in rows] == [(None, None)] * 2
     assert all(0 <= row["episode_cost"] <= 1 for row in rows)
@@ -131,7 +131,7 @@ def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None
         " its 2 rows are kept; resume=run goes on",
         err.splitlines()[-1],
     )
-    assert asked(tmp_path) == ["reset", *["step"] * 5, "reset", *["step"] * 3, "close"]
+    assert asked(tmp_path) == ["reset", "reset", *["step"] * 5, "reset", *["step"] * 3, "close"]
     cut = record.load_episode(tmp_path / "run", 2)
     assert cut is not None
     assert (cut.ended, cut.trajectory.x.shape, cut.trajectory.u.shape) == ("error", (3, 2), (2, 1))
@@ -193,11 +193,13 @@ def test_facts_that_are_given_are_not_asked_for() -> None:
     np.testing.assert_array_equal(known.start_std, [0.1, 0.1])
     assert (known.dt, known.horizon) == (0.1, 100)
     with pytest.raises(ValueError, match="give control_low= and control_high="):
-        env_spec("Bounds-v0", start_mean=[0])
+        env_spec("Bounds-v0", start_mean=[0, 0])
     with pytest.raises(ValueError, match="controls from -2 to 2 are not among its own, from -1 to 1"):
-        env_spec("Bounds-v0", control_low=[-2], control_high=[2], start_mean=[0])
+        env_spec("Bounds-v0", control_low=[-2], control_high=[2], start_mean=[0, 0])
     with pytest.raises(ValueError, match="start_mean has 3 entries; expected 2"):
         env_spec("Bounds-v0", control_low=[-1], control_high=[1], start_mean=[0, 0, 0])
+    with pytest.raises(ValueError, match="start_mean has 1 entries; expected 2"):
+        env_spec("Bounds-v0", control_low=[-1], control_high=[1], start_mean=[0])
 
 
 def test_runs_that_were_not_evaluated_have_no_curves_to_compare(learned: Path) -> None:

@@ -111,7 +111,7 @@ def env_spec(
                 f"controls from {least:g} to {greatest:g} are not among its own, from {bottom:g} to {top:g}"
             )
     size, rest = seen.shape[0], np.zeros(seen.shape)
-    mean, std = filled("start_mean", start_mean, size, rest), filled("start_std", start_std, size, rest)
+    mean, std = filled("start_mean", start_mean, size, rest, each=True), filled("start_std", start_std, size, rest)
     if not len(start_mean):
         places = starts(name, arguments)
         mean, std = places.mean(0), places.std(0)

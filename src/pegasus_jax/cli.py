@@ -1,4 +1,4 @@
-"""The commands: pegasus-train, -eval, -plot, -play, -figures. Each reads `key=value` words and ends with 0, 1 or 2."""
+"""The commands pegasus-train, -check, -eval, -plot, -play, -figures: they read `key=value` words end with 0 to 2."""
 
 import json
 import os
@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from pegasus_jax import interrupt
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import SIZES, SettingError, within
 from pegasus_jax.config import Config, Search
 
 TRAIN = """\
@@ -51,6 +51,19 @@ examples
 
 Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN or pegasus-play RUN; or with
 tensorboard --logdir RUN/tensorboard, after pip install tensorboard.
+"""
+
+CHECK = """\
+pegasus-check task=NAME [setting=value ...]     look at a task before it is learned
+
+Takes the words of pegasus-train, which looks first itself. Opens the environment, resets it once, drives nothing and
+closes it; without start_mean= it is reset more often, as pegasus-train does. Prints spaces, limits, control period,
+start and the cost there, and what its owner should know: a cost above 1, angles that look like degrees, readings that
+never change or follow from others. What cannot be learned is one line, and the exit status 2.
+
+examples
+  pegasus-check task=gym env=robot:Arm-v0 cost=robot:cost angles=[0] start_mean=[3.14,0]
+  pegasus-check task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
 """
 
 EVALUATE = """\
@@ -114,6 +127,11 @@ def train() -> None:
     main(_train, TRAIN)
 
 
+def check() -> None:
+    """Entry point of pegasus-check."""
+    main(_check, CHECK, stopped="nothing was written")
+
+
 def evaluate() -> None:
     """Entry point of pegasus-eval."""
     main(_evaluate, EVALUATE)
@@ -154,6 +172,8 @@ def _train(words: Sequence[str]) -> None:
 
     options, rest = settings.split(words, OPTIONS)
     command = shlex.join(["pegasus-train", *words])
+    if empty := [name for name in ("out", "resume") if options.get(name) == ""]:
+        raise SettingError(f"{empty[0]}= names no folder; for example {empty[0]}=runs/demo")
     if "resume" in options:
         if wrong := sorted(
             key for key in {*rest, *options} - {"resume", "final", *OPTIONS[4:]} if not _changeable(key)
@@ -195,7 +215,12 @@ def _train(words: Sequence[str]) -> None:
     from pegasus_jax.build import build
 
     kept = _shelf(config, len(runs))
-    build(replace(config, seed=0), over)  # so that impossible settings end here, before anything is written
+    task = build(replace(config, seed=0), over).task  # so that impossible settings end here, before anything is written
+    if "resume" not in options:
+        from pegasus_jax import check
+
+        for note in check.before_training(config, task, 1 if "start_mean" in rest else check.RESETS):
+            print(f"note: {note}", file=sys.stderr)
     if "resume" not in options and leads():
         if record.seeds_of(home):
             raise SettingError(f"out={home} holds runs already; resume={home} goes on, out={record.free(home)} is free")
@@ -207,6 +232,18 @@ def _train(words: Sequence[str]) -> None:
     train_seeds(config, runs, resume="resume" in options, command=command, final=final, mesh=over, shelf=kept)
     if leads():
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
+
+
+def _check(words: Sequence[str]) -> None:
+    from pegasus_jax import settings
+
+    options, rest = settings.split(words, OPTIONS)
+    if "resume" in options:
+        raise SettingError(f"resume={options['resume']} was checked when it began; give the words of a new run")
+    config = settings.parse(rest, options=OPTIONS)
+    from pegasus_jax.check import report
+
+    print("\n".join(report(config)))
 
 
 def _shelf(config: Config, seeds: int) -> Path | None:
@@ -357,6 +394,7 @@ def whole(name: str, text: str) -> int:
     """The whole number of an option. Raises SettingError when it is none, or 0 where nothing would be done."""
     if not text.isdecimal() or (name in ("episodes", "seeds", "jobs") and int(text) < 1):
         raise SettingError(f"{name}={text} is not a whole number; for example {name}=20")
+    within(name, int(text), 0, 2**32 - 1 if name == "seed" else SIZES["trials"])
     return int(text)
 
 

@@ -295,5 +295,4 @@ def leads() -> bool:
 
 def chunk(steps: int) -> int:
     """Search iterations between two looks at the clock: a divisor of `steps` near a tenth of it."""
-    divisors = [d for d in range(1, steps + 1) if steps % d == 0]
-    return next(d for d in divisors if d * 20 >= steps)
+    return next(d for d in range(-(-steps // 20), steps + 1) if steps % d == 0)

@@ -2,25 +2,23 @@
 
 import dataclasses
 import os
-import sys
 from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from traceback import extract_tb
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from pegasus_envs import mjcf
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
-from pegasus_envs.gym_plant import EnvSpec, env_plant, env_spec
+from pegasus_envs.gym_plant import EnvSpec, env_plant, env_spec, make_env, starts
 from pegasus_envs.gym_plant import close_environments as close_environments
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
-from pegasus_jax import interrupt
+from pegasus_jax import interrupt, user_code
 from pegasus_jax.checks import SettingError, nearest
 from pegasus_jax.config import Config
 from pegasus_jax.cost import expected_saturating, saturating, widened
@@ -111,22 +109,19 @@ def pinned(config: Config) -> Config:
     """
     if config.task == GYM:
         _complete(config)
+        environment(config)
         given = {name: getattr(config, name) for name in EnvSpec._fields}
         try:
             known = env_spec(config.env or "", config.env_args, **given)
         except ValueError as error:
             raise SettingError(f"env={config.env}: {' '.join(str(error).split())}") from error
-        except Exception as error:
-            raise SettingError(f"env={config.env} cannot be made: {told(error)}") from error
-        finally:
-            interrupt.reclaim()
         plain = {
             name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known._asdict().items()
         }
         return dataclasses.replace(config, **plain)
     if config.task != MJCF or config.mjcf is None:
         return config
-    return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf), mjcf_digest=mjcf.digest(_model(config)))
+    return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf), mjcf_digest=mjcf.digest(_known(config)))
 
 
 def of_gym(config: Config) -> Task:
@@ -152,23 +147,60 @@ def close(task: Task) -> None:
         interrupt.let_go(task.environment.close)
 
 
-def told(error: BaseException) -> str:
-    """What an error says, in one line, with the last line of a user's code that it passed."""
-    ours = {Path(__file__).parent, Path(env_plant.__code__.co_filename).parent}
-    theirs = [
-        frame
-        for frame in extract_tb(error.__traceback__)
-        if Path(frame.filename).parent not in ours and "site-packages" not in frame.filename
-    ]
-    where = f" ({Path(theirs[-1].filename).name}:{theirs[-1].lineno})" if theirs else ""
-    return f"{type(error).__name__}: {' '.join(str(error).split())}{where}"
-
-
 def _complete(config: Config) -> None:
     """Raises SettingError unless an environment is named, and a cost that there is: no robot is opened in vain."""
     if config.env is None or config.cost is None:
         raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
-    _function(config.cost)  # from now on modules in the working folder are found, the environment's too
+    user_code.load("cost", config.cost)  # from now on modules in the working folder are found, the environment's too
+
+
+def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the greatest observation [D] as far as its environment tells them, else infinite."""
+    if config.task == GYM:
+        space: Any = environment(config).observation_space
+        return np.asarray(space.low, float), np.asarray(space.high, float)
+    return np.full(len(task.state_names), -np.inf), np.full(len(task.state_names), np.inf)
+
+
+def readings(config: Config, resets: int) -> np.ndarray:
+    """What an environment observes after so many resets [N, D]; N is 0 for a simulation of our own.
+
+    Raises SettingError, in one line, for what the environment raises.
+    """
+    if config.task != GYM:
+        return np.zeros((0, len(config.start_mean)))
+    with user_code.blamed(f"env={config.env} cannot be reset"):
+        return starts(config.env or "", config.env_args, resets)
+
+
+def described(config: Config) -> dict[str, str]:
+    """What an environment says of itself, by name."""
+    if config.task != GYM:
+        return {"model": config.mjcf} if config.mjcf else {}
+    env: Any = environment(config)
+    layers = [env]
+    while hasattr(layers[-1], "env"):
+        layers.append(layers[-1].env)
+    spaces = {"observes": env.observation_space, "is driven by": env.action_space}
+    return {
+        "environment": " of ".join(type(layer).__name__ for layer in layers),
+        **{k: str(v) for k, v in spaces.items()},
+    }
+
+
+def environment(config: Config) -> Any:
+    """The environment of a config, opened once a process. Raises SettingError, in one line, where it cannot be made."""
+    name, _, _ = (config.env or "").rpartition(":")
+    if name:
+        user_code.importing(f"env={config.env}", name)
+    try:
+        return make_env(config.env or "", config.env_args)
+    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        raise SettingError(f"env={config.env}: {str(error).splitlines()[0]}") from error
+    except Exception as error:
+        raise SettingError(f"env={config.env} cannot be made: {user_code.told(error)}") from error
+    finally:
+        interrupt.reclaim()
 
 
 def of_mjcf(config: Config) -> Task:
@@ -178,9 +210,7 @@ def of_mjcf(config: Config) -> Task:
             "task=mjcf needs mjcf=, cost=, dt= and horizon=; for example "
             "mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40"
         )
-    model = _model(config)
-    if config.mjcf_digest not in (None, mjcf.digest(model)):
-        raise SettingError(f"mjcf={config.mjcf} is not what the run began with: its mjcf_digest differs")
+    model = _known(config)
     names = ("observe", "control_low", "control_high", "start_mean", "start_std")
     try:
         plant = mjcf.mechanism(model, config.dt or 0.0, **{name: getattr(config, name) for name in names})
@@ -189,6 +219,14 @@ def of_mjcf(config: Config) -> Task:
     name = Path(config.mjcf or "").stem
     task = _of_users(config, name, plant, plant, config.horizon or 0, plant.state_names, plant.control_names)
     return task._replace(rates=plant.rates)
+
+
+def _known(config: Config) -> Any:
+    """The file's model, if it is the one whose digest the config has, or that has none."""
+    model = _model(config)
+    if config.mjcf_digest not in (None, mjcf.digest(model)):
+        raise SettingError(f"mjcf={config.mjcf} is not what the run began with: its mjcf_digest differs")
+    return model
 
 
 def _model(config: Config) -> Any:
@@ -205,7 +243,7 @@ def _of_users(
     return Task(
         name=name,
         plant=plant,
-        cost=_function(config.cost or ""),
+        cost=user_code.load("cost", config.cost or ""),
         angles=_entries("angles", config.angles, name, len(states)),
         start_mean=about.start_mean,
         start_std=about.start_std,
@@ -216,7 +254,8 @@ def _of_users(
         dt=about.dt,
         state_names=states,
         control_names=controls,
-        stop=None if config.stop is None else _function(config.stop),
+        success=config.success,
+        stop=None if config.stop is None else user_code.load("stop", config.stop),
         stop_cost=config.stop_cost,
     )
 
@@ -229,17 +268,6 @@ def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> 
                 f"{setting}={entry} is not an entry of {name}'s observation; choose from 0 to {states - 1}"
             )
     return entries
-
-
-def _function(name: str) -> Callable[[Any], Any]:
-    """The function `module:function`, also from a module in the working folder."""
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
-    module, _, function = name.partition(":")
-    try:
-        return getattr(import_module(module), function)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise SettingError(f"cost={name} cannot be imported: {error}; expected cost=module:function") from error
 
 
 def pictures(task: Task, states: Any, width: int, height: int) -> list[np.ndarray]:

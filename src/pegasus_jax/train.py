@@ -14,7 +14,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 from tensorboardX import SummaryWriter
 
-from pegasus_jax import checkpoint, episode, record, settings, tasks
+from pegasus_jax import checkpoint, episode, record, settings, tasks, user_code
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
@@ -257,7 +257,7 @@ def failed(ran: Episode, task: Task, advice: str = "") -> None:
         raise ran.error
     if ran.error is not None:
         kept = f"; its {len(ran.trajectory.u)} rows are kept" if len(ran.trajectory.u) else ""
-        raise RunError(f"{task.name} failed in an episode, {tasks.told(ran.error)}{kept}{advice}") from ran.error
+        raise RunError(f"{task.name} failed in an episode, {user_code.told(ran.error)}{kept}{advice}") from ran.error
 
 
 def evaluate(keys: Key, params: Params, task: Task, program: Program, episodes: int) -> list[dict[str, Any]]:
