@@ -13,29 +13,21 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from benchmarks.study import RESULTS
 from pegasus_jax import checkpoint, record, settings
-from pegasus_jax.build import build
-from pegasus_jax.program import Program, share_processors
-from pegasus_jax.train import evaluate
+from pegasus_jax.machine import about
+from pegasus_jax.program import share_processors
+from pegasus_jax.restore import best
+from pegasus_jax.train import evaluate_run
 
 
 def policies(run: Path, episodes: int) -> dict[str, Any]:
     """Success rate and mean cost of the policy after each trial of a run, by trial."""
-    config = settings.load(run / "config.yaml")
-    experiment = build(config)
-    program, like = Program(experiment, 1), jax.eval_shape(experiment.init, jax.random.key(0))
-    found = {}
-    for trial in sorted(checkpoint.available(run)):
-        params = checkpoint.restore(run, trial, like).policy.params
-        stacked = jax.tree.map(lambda leaf: leaf[None], params)
-        (found[trial],) = evaluate(jax.random.key(0)[None], stacked, experiment.task, program, episodes)
+    found = {trial: evaluate_run(run, episodes, 0, trial) for trial in sorted(checkpoint.available(run))}
     rows = record.trials(run)
     return {
         "run": run.name,
-        "best": 0,
+        "best": best(run),
         "trials": list(found),
         "success_rate": [row["success_rate"] for row in found.values()],
         "mean_cost": [round(row["mean_cost"], 4) for row in found.values()],
@@ -61,8 +53,8 @@ def main(words: list[str]) -> None:
     for run in map(Path, runs):
         results.append(policies(run, int(options.get("episodes", "20"))))
         print(line(results[-1]), flush=True)
-        about = record.about(shlex.join(["python", "-m", "benchmarks.policies", *words]))
-        (RESULTS / f"policies-{name}.json").write_text(json.dumps({"runs": results, "about": about}, indent=1) + "\n")
+        made = about(shlex.join(["python", "-m", "benchmarks.policies", *words]))
+        (RESULTS / f"policies-{name}.json").write_text(json.dumps({"runs": results, "about": made}, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -15,13 +15,12 @@ import numpy as np
 import pytest
 
 from pegasus_envs.gym_plant import env_spec
-from pegasus_jax import record, settings, study
+from pegasus_jax import controller, record, settings, study
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
-from pegasus_jax.deploy import controller
 from pegasus_jax.record import RunError
 from pegasus_jax.report.curves import seeds_picture
-from pegasus_jax.train import newest
+from pegasus_jax.restore import restored
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "extending.md").read_text(), re.DOTALL)
@@ -109,7 +108,7 @@ def test_what_it_learned_is_a_function(learned: Path, monkeypatch: pytest.Monkey
     monkeypatch.chdir(learned)
     control = controller("run")
     assert asked(learned) == []
-    _, experiment, state = newest(learned / "run")
+    _, experiment, state = restored(learned / "run", "best")
     for x in np.random.default_rng(0).normal(size=(5, 2)) * 3:
         u = control(x)
         np.testing.assert_allclose(u, experiment.policy.apply(state.policy.params, None, x), rtol=1e-5)
@@ -142,7 +141,7 @@ def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None
         (5, "horizon", 0),
         (2, "error", 1),
     ]
-    assert int(newest(tmp_path / "run")[2].data.size) == 7
+    assert int(restored(tmp_path / "run")[2].data.size) == 7
     code, _, err = call("train", "resume=run", "trials=3", cwd=tmp_path)
     assert (code, asked(tmp_path)) == (0, []), err
 

@@ -33,6 +33,10 @@ class SettingError(ValueError):
     """A setting that cannot be; the message is one line for the person who set it."""
 
 
+class RunError(Exception):
+    """A run's folder is not as it should be; the message is one line for the person who named it."""
+
+
 def nearest(name: str, choices: Iterable[str]) -> str:
     """The end of an error message: the nearest valid choice, and all of them."""
     choices = [str(c) for c in choices]

@@ -9,9 +9,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pegasus_jax import interrupt
+from pegasus_jax import cache, files, interrupt
 from pegasus_jax.checks import SIZES, SettingError, within
-from pegasus_jax.config import Config, Search
+from pegasus_jax.config import Search
 
 TRAIN = """\
 pegasus-train task=NAME [setting=value ...]     learn a controller
@@ -67,9 +67,10 @@ examples
 """
 
 EVALUATE = """\
-pegasus-eval RUN [episodes=20] [seed=0] [json=true]     run a learned policy on its plant
+pegasus-eval RUN [trial=last] [episodes=20] [seed=0] [json=true]     run a learned policy on its plant
 
-Uses the newest whole checkpoint of the run, finished or not, and episodes that never become data.
+Uses the policy after trial=N, trial=best or the last trial, and episodes that never become data. mjcf=FILE names the
+model's file where it was moved.
 Prints mean cost per step, success rate (last five steps cost less than .2 on average) and the run's fingerprint:
 SHA-256 over data, model and policy parameters. With json=true, one JSON object.
 """
@@ -84,7 +85,7 @@ bootstrap interval.
 """
 
 PLAY = """\
-pegasus-play RUN [episodes=1] [seed=0]     film a learned policy on its plant
+pegasus-play RUN [trial=last] [episodes=1] [seed=0]     film a learned policy on its plant
 
 Writes RUN/play.mp4: fresh episodes of the newest whole checkpoint of the run, finished or not, in real time,
 20 pictures a second, with cost and command drawn below as they come about. Another seed= gives other starts and
@@ -179,11 +180,13 @@ def _train(words: Sequence[str]) -> None:
             key for key in {*rest, *options} - {"resume", "final", *OPTIONS[4:]} if not _changeable(key)
         ):
             raise SettingError(
-                f"{wrong[0]} cannot be changed by resume=; only trials=, evaluation=, fit.* and search.* can"
+                f"{wrong[0]} cannot be changed by resume=; only trials=, evaluation=, fit.*, search.* can, and mjcf= if"
+                " the file was moved"
             )
         home = Path(options["resume"])
         runs = record.seeds_of(home)
         first = record.existing(next(iter(runs.values()), home))
+        mjcf = rest.pop("mjcf", None)
         config = settings.override(settings.load(first / "config.yaml"), settings.values(rest))
         runs = runs or {config.seed: home}
     else:
@@ -211,10 +214,15 @@ def _train(words: Sequence[str]) -> None:
         print(progress.devices(), flush=True)
     from pegasus_jax.tasks import pinned
 
-    config = config if "resume" in options else pinned(config)
+    if "resume" in options:
+        from pegasus_jax import restore
+
+        config = restore.moved(config, mjcf)
+        restore.announce(first, config)
+    else:
+        config = pinned(config)
     from pegasus_jax.build import build
 
-    kept = _shelf(config, len(runs))
     task = build(replace(config, seed=0), over).task  # so that impossible settings end here, before anything is written
     if "resume" not in options:
         from pegasus_jax import check
@@ -229,7 +237,7 @@ def _train(words: Sequence[str]) -> None:
     from pegasus_jax.train import train_seeds
 
     final = options.get("final") == "true"
-    train_seeds(config, runs, resume="resume" in options, command=command, final=final, mesh=over, shelf=kept)
+    train_seeds(config, runs, resume="resume" in options, command=command, final=final, mesh=over)
     if leads():
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
 
@@ -246,23 +254,9 @@ def _check(words: Sequence[str]) -> None:
     print("\n".join(report(config)))
 
 
-def _shelf(config: Config, seeds: int) -> Path | None:
-    """Where the programs of a config for so many seeds are kept; then JAX's own cache is switched off."""
-    import jax
-
-    from pegasus_jax.build import set_precision
-    from pegasus_jax.compiled import shelf
-
-    set_precision(config)
-    kept = shelf(replace(config, seed=0), seeds=seeds)
-    if kept is not None:
-        jax.config.update("jax_enable_compilation_cache", False)
-    return kept
-
-
 def _changeable(key: str) -> bool:
     """Whether a run can go on with another value of this setting: what it has learned stays what it is."""
-    return key in ("trials", "evaluation") or key.startswith(("fit.", "search."))
+    return key in ("trials", "evaluation", "mjcf") or key.startswith(("fit.", "search."))
 
 
 def _join(options: dict[str, str]) -> None:
@@ -308,14 +302,13 @@ def _mesh(text: str | None, seeds: int) -> Any:
 
 
 def _evaluate(words: Sequence[str]) -> None:
-    run, rest = _run_and(words, {"episodes": "20", "seed": "0", "json": "false"})
+    run, rest = _run_and(words, {"episodes": "20", "seed": "0", "json": "false", "trial": "last", "mjcf": ""})
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     if rest["json"] not in ("true", "false"):
         raise SettingError(f"json={rest['json']} is neither true nor false")
-    from pegasus_jax import settings
     from pegasus_jax.train import evaluate_run
 
-    result = evaluate_run(run, episodes, seed, _shelf(settings.load(run / "config.yaml"), 1))
+    result = evaluate_run(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None)
     if rest["json"] == "true":
         print(json.dumps(result))
     else:
@@ -324,24 +317,23 @@ def _evaluate(words: Sequence[str]) -> None:
 
 def _plot(words: Sequence[str]) -> None:
     run, _ = _run_and(words, {}, many=True)
-    from pegasus_jax import record, settings, tasks
+    from pegasus_jax import record
     from pegasus_jax.report.curves import seeds_picture
     from pegasus_jax.report.plot import run_pictures
 
     if runs := record.seeds_of(run):
         print(seeds_picture(list(runs.values()), run / "learning.png"))
         return
-    config = settings.load(run / "config.yaml")
-    for path in run_pictures(run, tasks.of_config(config)):
+    for path in run_pictures(run, record.task_of(run)):
         print(path)
 
 
 def _play(words: Sequence[str]) -> None:
-    run, rest = _run_and(words, {"episodes": "1", "seed": "0"})
+    run, rest = _run_and(words, {"episodes": "1", "seed": "0", "trial": "last", "mjcf": ""})
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     from pegasus_jax.report.play import film
 
-    print(film(run, episodes, seed))
+    print(film(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None))
 
 
 def _figures(words: Sequence[str]) -> None:
@@ -395,6 +387,15 @@ def whole(name: str, text: str) -> int:
     if not text.isdecimal() or (name in ("episodes", "seeds", "jobs") and int(text) < 1):
         raise SettingError(f"{name}={text} is not a whole number; for example {name}=20")
     within(name, int(text), 0, 2**32 - 1 if name == "seed" else SIZES["trials"])
+    return int(text)
+
+
+def _trial(text: str) -> int | str:
+    """The trial whose policy is asked for. Raises SettingError for a text that names none."""
+    if text in ("last", "best"):
+        return text
+    if not text.isdecimal():
+        raise SettingError(f"trial={text} is not a trial; expected a number, best or last")
     return int(text)
 
 
@@ -465,7 +466,7 @@ def _let_robots_go() -> None:
 
 def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: str) -> int:
     """The exit status of a command that nobody stopped."""
-    from pegasus_jax.record import RunError
+    from pegasus_jax.checks import RunError
 
     try:
         words = [*words, *(_always() if words and command in (_train, _figures) else ())]
@@ -478,7 +479,16 @@ def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: 
         interrupt.clean_up()
         print(f"pegasus: {error}", file=sys.stderr)
         return 2
+    except OSError as error:
+        interrupt.clean_up()
+        print(f"pegasus: {files.refused(error)}{_goes_on()}", file=sys.stderr)
+        return 2
     return 0
+
+
+def _goes_on() -> str:
+    """How to go on with what was begun."""
+    return f"; every finished episode is kept, resume={_begun[0]} goes on" if _begun else ""
 
 
 def _always() -> list[str]:
@@ -491,8 +501,16 @@ def _always() -> list[str]:
 
 
 def _remember_compilations() -> None:
-    """Keep compiled programs in the user's cache folder, unless JAX, which is not imported yet, is told where."""
-    if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
-        cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pegasus_jax"
-        os.environ["JAX_COMPILATION_CACHE_DIR"] = str(cache)
+    """Keep compiled programs in the user's cache folder, unless JAX, which is not imported yet, is told where.
+
+    In none that is unsafe.
+    """
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR", cache.folder())
+    if not folder or "://" in folder:
+        return
+    if problem := cache.problem(Path(folder)):
+        print(f"{folder} {problem}; programs are compiled as if for the first time", file=sys.stderr)
+        os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
+    elif "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
         os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")

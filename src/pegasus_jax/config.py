@@ -265,7 +265,6 @@ class Config:
     legs: int = setting(2, "that the swimmer drives: 2 or 6", ("swimmer_*",))
     env: str | None = setting(None, "the environment's Gymnasium id", GYM)
     mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", MJCF)
-    mjcf_digest: str | None = setting(None, "SHA-256 of the compiled file; a run notes it, and refuses another", MJCF)
     cost: str | None = setting(None, "module:function, observation [D] -> cost in [0, 1], in JAX", OWN)
     angles: tuple[int, ...] = setting((), "the entries of the observation that are angles [rad]", OWN)
     rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", GYM)

@@ -10,6 +10,8 @@ import numpy as np
 from pegasus_jax import interrupt
 from pegasus_jax.types import Array, Episode, Key, Task, Trajectory
 
+CUT = ("error", "interrupted")  # how an episode can end by no doing of its policy
+
 
 def run(key: Key, act: Callable[[Key, Array, Array], Array], task: Task) -> Trajectory:
     """H control periods of act(key, t, x [D]) -> u [U] on the task's plant, from a random start.
@@ -109,6 +111,28 @@ def charged(cost: Any, task: Task) -> np.ndarray:
     """The costs [H] of an episode of L periods: each of those that an early end left out costs `task.stop_cost`."""
     cost = np.asarray(cost, np.float64)
     return np.concatenate([cost, np.full(task.horizon - len(cost), task.stop_cost)])
+
+
+def mean_cost(ran: Episode, task: Task) -> float:
+    """Mean cost a step of an episode; of one that a fault or a person cut short, of the steps that there were.
+
+    The same number for an episode that was just run and for one that was read back.
+    """
+    cost = np.asarray(ran.trajectory.cost, np.float64)
+    return float(np.mean(cost if ran.ended in CUT else charged(cost, task)))
+
+
+def succeeded(costs: Any, task: Task) -> np.ndarray:
+    """Which episodes [...] of costs [..., H] succeeded: their last five steps cost little on average."""
+    return np.mean(np.asarray(costs)[..., -5:], axis=-1) < task.success
+
+
+def verdict(ran: Episode, task: Task) -> dict[str, Any]:
+    """What an episode says of its policy: its mean cost a step, and whether it succeeded."""
+    return {
+        "episode_cost": mean_cost(ran, task),
+        "episode_success": bool(succeeded(charged(ran.trajectory.cost, task), task)),
+    }
 
 
 def uniform(key: Key, low: Array, high: Array, horizon: int) -> Array:

@@ -7,7 +7,6 @@ from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from functools import cache, partial
 from importlib.metadata import entry_points
-from pathlib import Path
 from threading import Thread
 from typing import Any
 
@@ -18,9 +17,8 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
 from pegasus_jax import mesh
-from pegasus_jax.compiled import program
 from pegasus_jax.episode import trimmed
-from pegasus_jax.record import processors
+from pegasus_jax.machine import processors
 from pegasus_jax.types import Episode, Experiment, Params, Trajectory
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
@@ -51,10 +49,9 @@ FEW = 128  # particles that one thread of a processor imagines as fast as two
 class Jitted:
     """A jitted function that says how long its caller waited for compiling; compiles once, or it is a defect."""
 
-    def __init__(self, function: Callable[..., Any], kept: Path | None = None, **options: Any) -> None:
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
         self.coming: Future | None = None
-        self.kept, self.options = kept, options  # where it is on disk, and how it was made
 
     def ready(self, *arguments: Any) -> None:
         """Wait until it is compiled for arguments of these shapes."""
@@ -69,17 +66,14 @@ class Jitted:
         return begun(lambda: jax.block_until_ready(compiled(*arguments))).result()
 
     def compile(self, *arguments: Any) -> Any:
-        """The function compiled for arguments of these shapes, now or by an earlier command."""
-        if self.kept is not None:
-            return program(self.kept, self.function, arguments, self.options)
+        """The function compiled for arguments of these shapes."""
         return self.function.lower(*arguments).compile()
 
 
 class Program:
     """An experiment over S seeds: every argument and result has a leading axis [S], except those that all share.
 
-    With a mesh, the seeds lie on its devices; those of several processes call every part together. With a `shelf`,
-    which is this experiment's alone (`compiled.shelf`), its programs are kept there.
+    With a mesh, the seeds lie on its devices; those of several processes call every part together.
     """
 
     def __init__(
@@ -89,7 +83,6 @@ class Program:
         seeds: int = 1,
         over: Mesh | None = None,
         side_by_side: bool | None = None,
-        shelf: Path | None = None,
     ) -> None:
         self.mesh, self.seeds = over, seeds
         self.drive, self.horizon = experiment.drive, experiment.task.horizon
@@ -113,7 +106,6 @@ class Program:
         self.parts = {
             name: Jitted(
                 over_seeds(function, axes, seeds=seeds, over=over),
-                kept=shelf and shelf.with_name(f"{shelf.name}-{name}{self.chunk if name == 'search' else ''}"),
                 compiler_options=compiler_options(LASTING if name in LONG else BRIEFLY),
                 **layout,
             )

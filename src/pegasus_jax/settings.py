@@ -15,7 +15,7 @@ from yaml import YAMLError
 from pegasus_jax.checks import SettingError, called, nearest, shown
 from pegasus_jax.config import Config
 from pegasus_jax.defaults import BEST, NAMES, defaults
-from pegasus_jax.record import write_whole
+from pegasus_jax.files import write_whole
 from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 
 # Keys that select a named variant, and what they select from.
@@ -146,8 +146,8 @@ def load(path: Path) -> Config:
     A setting that the file lacks is younger than the run, and its default leaves everything as it was.
     """
     try:
-        stored: Any = OmegaConf.to_container(OmegaConf.load(path))
-    except (OSError, ValueError, OmegaConfBaseException, YAMLError) as error:
+        stored: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+    except (OSError, ValueError, RecursionError, OmegaConfBaseException, YAMLError) as error:
         raise SettingError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
     if not isinstance(stored, dict) or "task" not in stored:
         raise SettingError(f"{path} is not the config of a run")
@@ -194,6 +194,8 @@ def _changed(node: Any, changes: dict[str, Any], prefix: str) -> Any:
 
 def _converted(node: Any, name: str, value: Any, key: str) -> Any:
     """The value as the type of the dataclass's field of that name."""
+    if "${" in str(value):  # OmegaConf would put another setting there, or a variable of the environment
+        raise SettingError(f"{key}={shown(value)} is not a value but a reference to one; write the value itself")
     current = getattr(node, name)
     field = next(f for f in dataclasses.fields(node) if f.name == name)
     schema = OmegaConf.structured(dataclasses.make_dataclass("One", [(name, field.type, current)]))

@@ -17,9 +17,10 @@ from pegasus_jax.build import build, set_precision
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
 from pegasus_jax.defaults import GYM
+from pegasus_jax.episode import succeeded
+from pegasus_jax.files import write_whole
 from pegasus_jax.program import LASTING, compiler_options, described
-from pegasus_jax.record import write_whole
-from pegasus_jax.train import saturated, succeeded
+from pegasus_jax.train import saturated
 from pegasus_jax.trial import TrialInfo, trial
 from pegasus_jax.types import Array, Experiment, RunState, Task
 

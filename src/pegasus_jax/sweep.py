@@ -125,7 +125,7 @@ def show(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) 
 
 def local(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) -> None:
     """Run the jobs as processes of this machine. Raises RunError when any failed."""
-    from pegasus_jax.record import RunError
+    from pegasus_jax.checks import RunError
 
     del options
     executor = _executor("local", out)

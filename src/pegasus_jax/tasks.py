@@ -102,7 +102,7 @@ def input_scale(task: Task, units: tuple[float, ...]) -> Any:
 
 
 def pinned(config: Config) -> Config:
-    """The config for a run's folder: it finds its MJCF file from anywhere, and knows it by its content.
+    """The config for a run's folder: it finds its MJCF file from anywhere.
 
     That of a Gymnasium environment says all that has to be known of it, so that whoever reads the folder, or goes on
     with it, neither opens nor resets it: it may be a robot.
@@ -121,7 +121,7 @@ def pinned(config: Config) -> Config:
         return dataclasses.replace(config, **plain)
     if config.task != MJCF or config.mjcf is None:
         return config
-    return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf), mjcf_digest=mjcf.digest(_known(config)))
+    return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf))
 
 
 def of_gym(config: Config) -> Task:
@@ -210,7 +210,7 @@ def of_mjcf(config: Config) -> Task:
             "task=mjcf needs mjcf=, cost=, dt= and horizon=; for example "
             "mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40"
         )
-    model = _known(config)
+    model = _model(config)
     names = ("observe", "control_low", "control_high", "start_mean", "start_std")
     try:
         plant = mjcf.mechanism(model, config.dt or 0.0, **{name: getattr(config, name) for name in names})
@@ -221,12 +221,9 @@ def of_mjcf(config: Config) -> Task:
     return task._replace(rates=plant.rates)
 
 
-def _known(config: Config) -> Any:
-    """The file's model, if it is the one whose digest the config has, or that has none."""
-    model = _model(config)
-    if config.mjcf_digest not in (None, mjcf.digest(model)):
-        raise SettingError(f"mjcf={config.mjcf} is not what the run began with: its mjcf_digest differs")
-    return model
+def mjcf_digest(task: Task) -> str | None:
+    """SHA-256 of the compiled model of a task=mjcf, whatever files it was made of; None of another task."""
+    return mjcf.digest(task.plant.model) if isinstance(task.plant, mjcf.Mechanism) else None
 
 
 def _model(config: Config) -> Any:

@@ -12,18 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
-from tensorboardX import SummaryWriter
 
-from pegasus_jax import checkpoint, episode, record, settings, tasks, user_code
+from pegasus_jax import checkpoint, episode, record, restore, settings, tasks, user_code
+from pegasus_jax.board import Board
 from pegasus_jax.build import build, set_precision
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import RunError, SettingError
 from pegasus_jax.config import Config
 from pegasus_jax.dataset import grow
 from pegasus_jax.program import Program, fetched, leads
 from pegasus_jax.progress import Display, summary
-from pegasus_jax.record import RunError
 from pegasus_jax.trial import COLLECT, EVALUATE, trial_key
-from pegasus_jax.types import Episode, Experiment, Key, Learner, Params, RunState, Task, Trajectory
+from pegasus_jax.types import Episode, Experiment, Key, Params, RunState, Task, Trajectory
 
 # What `improved` says of a trial that has not improved anything.
 UNKNOWN: dict[str, Any] = {
@@ -58,37 +57,41 @@ def train_seeds(
     command: str = "",
     final: bool = False,
     mesh: Mesh | None = None,
-    shelf: Path | None = None,
 ) -> RunState:
     """`train` for the seeds and folders of `runs`, all as one program; returns their states [S, ...].
 
     Each folder is what a run of that seed alone would leave, and can be resumed alone. The seeds share nothing but the
     clock: one that diverges leaves the others as they are. All go on from the newest trial that all have finished.
     With a `mesh` (mesh.py) of several devices the seeds are shared out among them; where several processes hold the
-    devices, all call this together, see the same files, and the first one writes. `shelf` is as for `Program`.
+    devices, all call this together, see the same files, and the first one writes.
     """
     folders, seeds = list(runs.values()), list(runs)
     with ExitStack() as held:
         for run in folders if leads() else ():
-            held.enter_context(record.lock(run))
+            held.enter_context(record.lock(run, new=not resume))
+            record.remove_unfinished(run)
         before = settings.load(folders[0] / "config.yaml") if resume else config
         if config.trials < before.trials:
             raise SettingError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
         set_precision(config)
         experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
         held.callback(tasks.close, experiment.task)
-        program = Program(experiment, config.search.steps, len(seeds), mesh, shelf=shelf)
+        for run in folders if resume else ():
+            restore.same(run, experiment.task)
+        program = Program(experiment, config.search.steps, len(seeds), mesh)
         display = Display(config.trials, quiet=not leads())
         program.on_compile = held.enter_context(display.running()).compiling
-        states = together(folders, replace(before, seed=0), display) if resume else None
+        states = restore.together(folders, experiment, display.line) if resume else None
         done = 0 if states is None else int(states.trial[0])
         if max(done + 1, config.explore.trials) <= config.trials:  # else no policy is searched
             program.prepare("search")
         keys = jnp.stack([jax.random.key(seed) for seed in seeds])
         if states is None:
             states = program("init", keys)
-        elif (config.fit, config.search) != (before.fit, before.search):
-            states = suited(states, program("init", keys))
+        elif (config.fit, config.search) != (before.fit, before.search) or any(
+            learner.optimizer is None for learner in (states.model, states.policy)
+        ):
+            states = restore.suited(states, program("init", keys))
         room = config.trials * experiment.task.horizon
         if room > states.data.x.shape[1]:
             states = states._replace(data=jax.vmap(partial(grow, capacity=room))(states.data))
@@ -96,15 +99,15 @@ def train_seeds(
         boards = []
         for seed, run in runs.items() if leads() else ():
             settings.save(replace(config, seed=seed), run / "config.yaml")
-            record.note(run, command, done)
-            record.write_trials(run, record.trials(run)[:done])
-            boards.append(held.enter_context(SummaryWriter(str(run / "tensorboard"), purge_step=done + 1)))
+            record.note(run, command, done, experiment.task)
+            record.write_trials(run, record.readable_trials(run)[0][:done])
+            boards.append(Board(run / "tensorboard", done + 1, display.line))
         for trial in range(done + 1, config.trials + 1):
             states, rows = one_trial(states, trial, config, folders, experiment, program, display)
             whole = fetched(states)
             for index, board in enumerate(boards):
                 record.write_trials(folders[index], [*record.trials(folders[index]), rows[index]])
-                scalars(board, rows[index])
+                board.add(rows[index])
                 checkpoint.save(folders[index], trial, part(whole, index))
             display.line(summary(rows, config.trials))
         if final:
@@ -147,7 +150,7 @@ def one_trial(
             "plant_seconds": round(int(rows_so_far[index]) * task.dt, 6),
             "random": random,
             "policy": 0 if random else int(policies[index]),
-            "episode_cost": episode_cost(ran, task),
+            **episode.verdict(ran, task),
             "steps": len(ran.trajectory.u),
             "ended": ran.ended,
             **evaluation[index],
@@ -228,10 +231,7 @@ def collected(
                         run, trial, ran.trajectory, task, policy=0 if random else int(policies[index]), ended=ran.ended
                     )
                 failed(ran, task, f"; resume={run} goes on")
-    found = [ran for ran in episodes if ran is not None]
-    for ran in found:
-        costed(ran.trajectory, task, trial)
-    return found
+    return [costed(ran, task, trial) for ran in episodes if ran is not None]
 
 
 def finite(trajectory: Trajectory, task: Task, trial: int) -> None:
@@ -244,11 +244,18 @@ def finite(trajectory: Trajectory, task: Task, trial: int) -> None:
         )
 
 
-def costed(trajectory: Trajectory, task: Task, trial: int) -> None:
-    """Raises RunError, which names trial and state, where the cost of an episode is not a finite number."""
-    cost, x = np.asarray(trajectory.cost), np.asarray(trajectory.x)
+def costed(ran: Episode, task: Task, trial: int) -> Episode:
+    """The episode with its costs, which are counted again where they are not finite: the user may have mended the cost.
+
+    Raises RunError, which names trial and observation, where they are not finite then either.
+    """
+    if np.isfinite(ran.trajectory.cost).all():
+        return ran
+    x = np.asarray(ran.trajectory.x)
+    cost = np.asarray(jax.vmap(task.cost)(jnp.asarray(x[1:])))
     for (t,) in np.argwhere(~np.isfinite(cost))[:1]:
         raise RunError(f"trial {trial}: the cost of the observation {x[t + 1].tolist()} is {cost[t]}; mend the cost")
+    return ran._replace(trajectory=ran.trajectory._replace(cost=cost))
 
 
 def failed(ran: Episode, task: Task, advice: str = "") -> None:
@@ -268,7 +275,7 @@ def evaluate(keys: Key, params: Params, task: Task, program: Program, episodes: 
     costs = program.evaluate(keys, params) if task.environment is None else driven(keys, params, task, program)
     return [
         {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(success))}
-        for cost, success in zip(costs, succeeded(costs, task), strict=True)
+        for cost, success in zip(costs, episode.succeeded(costs, task), strict=True)
     ]
 
 
@@ -280,18 +287,6 @@ def driven(keys: Key, params: Params, task: Task, program: Program) -> np.ndarra
             failed(ran, task)
             costs.append(episode.charged(ran.trajectory.cost, task))
     return np.reshape(costs, (keys.shape[1], keys.shape[0], task.horizon)).swapaxes(0, 1)
-
-
-def episode_cost(ran: Episode, task: Task) -> float:
-    """Mean cost a step of an episode: the same number when it was just run and when it is read back."""
-    cost = np.asarray(ran.trajectory.cost, np.float64)
-    cut_short = ran.ended in ("error", "interrupted")  # nobody knows what would have come
-    return float(np.mean(cost if cut_short else episode.charged(cost, task)))
-
-
-def succeeded(costs: Any, task: Task) -> np.ndarray:
-    """Which episodes [...] of costs [..., H] succeeded: their last five steps cost little on average."""
-    return np.mean(costs[..., -5:], axis=-1) < task.success
 
 
 def saturated(u: Any, task: Task) -> np.ndarray:
@@ -318,51 +313,19 @@ def part(tree: Any, index: int) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
-def together(runs: Sequence[Path], config: Config, display: Display) -> RunState | None:
-    """The states [S, ...] of the newest trial of which every run has a whole checkpoint, or None."""
-    shared = set.intersection(*(set(checkpoint.available(run)) for run in runs))
-    for trial in sorted(shared, reverse=True):
-        problems = [problem for run in runs if (problem := checkpoint.damage(run, trial)) is not None]
-        if not problems:
-            like = jax.eval_shape(build(config).init, jax.random.key(0))
-            try:
-                states = [checkpoint.restore(run, trial, like) for run in runs]
-            except RunError as error:
-                problems = [str(error)]
-            else:
-                return jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-        for problem in problems:
-            display.line(f"checkpoint {trial} is not usable: {problem}; going on from the one before it")
-    return None
+def evaluate_run(
+    run: Path,
+    episodes: int,
+    seed: int,
+    trial: restore.Trial = restore.LAST,
+    mjcf: str | None = None,
+) -> dict[str, Any]:
+    """How the policy of a trial does on its plant, and the run's fingerprint then.
 
-
-def suited(states: RunState, fresh: RunState) -> RunState:
-    """The states, with fresh optimisers where the settings ask for others than the run had so far."""
-
-    def shape(tree: Any) -> tuple[Any, list[Any]]:
-        return jax.tree.structure(tree), jax.tree.map(jnp.shape, jax.tree.leaves(tree))
-
-    def learner(old: Learner, new: Learner) -> Learner:
-        same = shape(old.optimizer) == shape(new.optimizer)
-        return old if same else old._replace(optimizer=new.optimizer)
-
-    return states._replace(model=learner(states.model, fresh.model), policy=learner(states.policy, fresh.policy))
-
-
-def newest(run: Path) -> tuple[Config, Experiment, RunState]:
-    """A run's config, its experiment and its newest whole state. Raises RunError when there is none yet."""
-    config = settings.load(run / "config.yaml")
-    set_precision(config)
-    states = together([run], config, Display(config.trials))
-    if states is None:
-        raise RunError(f"{run} has no checkpoint that this version can use yet; resume={run} makes one")
-    return config, build(config), part(states, 0)
-
-
-def evaluate_run(run: Path, episodes: int, seed: int, shelf: Path | None = None) -> dict[str, Any]:
-    """How the newest policy of a run does on its plant, and the run's fingerprint. `shelf` is as for `Program`."""
-    _, experiment, state = newest(run)
-    program = Program(experiment, 1, shelf=shelf)
+    `mjcf` is where the model's file is now, if it is not where it was.
+    """
+    _, experiment, state = restore.ready(run, trial, mjcf)
+    program = Program(experiment, 1)
     params = jax.tree.map(lambda leaf: leaf[None], state.policy.params)
     keys = jax.random.key(seed)[None]
     try:
@@ -370,10 +333,3 @@ def evaluate_run(run: Path, episodes: int, seed: int, shelf: Path | None = None)
     finally:
         tasks.close(experiment.task)
     return {"trial": int(state.trial), "episodes": episodes, **result, "fingerprint": checkpoint.fingerprint(state)}
-
-
-def scalars(board: SummaryWriter, row: dict[str, Any]) -> None:
-    """The numbers of a trial's row as TensorBoard scalars."""
-    for name, value in {**row, **{f"seconds/{k}": v for k, v in row["seconds"].items()}}.items():
-        if isinstance(value, int | float):
-            board.add_scalar(name, value, row["trial"])

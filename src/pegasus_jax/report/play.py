@@ -15,9 +15,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from pegasus_jax import episode, tasks
-from pegasus_jax.record import RunError
-from pegasus_jax.train import newest
+from pegasus_jax import episode, restore, tasks
+from pegasus_jax.checks import RunError
 from pegasus_jax.types import Array, Key, Params, Policy, Task, Trajectory
 
 WIDTH, HEIGHT, STRIP = 640, 480, 192  # [pixels], multiples of the 16 of a video's blocks
@@ -37,9 +36,9 @@ class Strip(NamedTuple):
     bottom: int  # last row of the axes
 
 
-def film(run: Path, episodes: int, seed: int) -> Path:
+def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.LAST, mjcf: str | None = None) -> Path:
     """Write RUN/play.mp4: `episodes` episodes that are not data, one after the other, in real time."""
-    config, experiment, state = newest(run)
+    config, experiment, state = restore.ready(run, trial, mjcf)
     task, mean = experiment.task, config.policy.execution == "mean"
     if not hasattr(task.plant, "glide"):
         raise RunError(f"{run} learned {task.name}; only plants in JAX can be filmed")
