@@ -70,8 +70,11 @@ def test_several_seeds_are_means_and_the_median_of_the_errors() -> None:
 
 
 def test_the_best_policy_is_named() -> None:
-    assert best_line(ROW) == "best policy: trial 7 (success 85%, cost 0.310)"
-    assert best_line(ROW | UNMEASURED) == "best policy: trial 7 (not evaluated)"
+    rows = [ROW | {"trial": n, "policy": n - 1, "success_rate": n / 4, "episode_cost": n / 10} for n in (1, 2, 3)]
+    assert best_line(rows, 2) == "best policy: trial 2 (success 50%, cost 0.310)"
+    robot = [row | UNMEASURED for row in rows]
+    assert best_line(robot, 1) == "best policy: trial 1 (cost 0.200 in 1 of the episodes)"
+    assert best_line(robot, 3) == "best policy: trial 3 (not run yet)"
 
 
 def test_a_person_reads_durations() -> None:
