@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import os
 import re
+import signal
 import subprocess
 import sys
 import time
@@ -69,8 +70,11 @@ def test_several_seeds_are_means_and_the_median_of_the_errors() -> None:
 
 
 def test_the_best_policy_is_named() -> None:
-    assert best_line(ROW) == "best policy: trial 7 (success 85%, cost 0.310)"
-    assert best_line(ROW | UNMEASURED) == "best policy: trial 7 (not evaluated)"
+    rows = [ROW | {"trial": n, "policy": n - 1, "success_rate": n / 4, "episode_cost": n / 10} for n in (1, 2, 3)]
+    assert best_line(rows, 2) == "best policy: trial 2 (success 50%, cost 0.310)"
+    robot = [row | UNMEASURED for row in rows]
+    assert best_line(robot, 1) == "best policy: trial 1 (cost 0.200 in 1 of the episodes)"
+    assert best_line(robot, 3) == "best policy: trial 3 (not run yet)"
 
 
 def test_a_person_reads_durations() -> None:
@@ -189,3 +193,15 @@ def test_words_of_the_environment_come_after_those_that_are_typed(tmp_path: Path
         done = helped(wrong)
         assert (done.returncode, done.stderr.count("\n")) == (2, 1)
         assert wrong.partition("=")[0] in done.stderr or "PEGASUS_SETTINGS" in done.stderr
+
+
+def test_the_first_line_comes_first_and_a_stop_before_the_run_begins_says_so(tmp_path: Path) -> None:
+    program = [sys.executable, "-c", "from pegasus_jax.cli import train; train()", "task=cartpole", "out=demo"]
+    process = subprocess.Popen(program, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert line == "learning cartpole, model lagrangian, policy mlp: 15 trials, folder demo\n"
+    assert err == "stopped before anything was written to demo; the same command begins again\n"
+    assert process.returncode == 130

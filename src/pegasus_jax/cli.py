@@ -199,9 +199,9 @@ def _train(words: Sequence[str]) -> None:
         raise SettingError(f"seeds={len(runs)} is too many for task=gym, whose environment is one object; seeds=1")
     if options.get("final", "false") not in ("true", "false"):
         raise SettingError(f"final={options['final']} is neither true nor false")
-    done = len(record.trials(first)) if "resume" in options else None
-    print(progress.announcement(config, home, len(runs), done), flush=True)
+    done = len(record.readable_trials(first)[0]) if "resume" in options else None
     _begun.append(home)
+    print(progress.announcement(config, home, len(runs), done), flush=True)
     _join(options)
     from pegasus_jax.program import leads, share_processors
 
@@ -239,6 +239,11 @@ def _train(words: Sequence[str]) -> None:
     final = options.get("final") == "true"
     train_seeds(config, runs, resume="resume" in options, command=command, final=final, mesh=over)
     if leads():
+        from pegasus_jax import restore
+
+        for seed, run in runs.items():
+            told = progress.best_line(record.trials(run), restore.best(run))
+            print(f"seed {seed}: {told}" if len(runs) > 1 else told)
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
 
 
@@ -428,7 +433,7 @@ def _help(text: str, words: Sequence[str]) -> str:
 def main(
     command: Callable[[Sequence[str]], None],
     text: str,
-    stopped: str = "every finished episode is kept, resume=RUN goes on",
+    stopped: str = "nothing was learned",
 ) -> None:
     """Run a command: 0 done, 2 a setting or a run's folder that cannot be, in one line, 130 after Ctrl-C.
 

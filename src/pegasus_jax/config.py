@@ -33,7 +33,9 @@ class MLP:
     dropout: float = setting(0.0, "drop probability of the hidden units; 0 is a deterministic policy")
     squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
     execution: str = setting("sampled", "on the plant: sampled (a fresh mask each step, explores), or mean")
-    input_units: tuple[float, ...] = setting((), "what it counts each state that is no angle in; []: the plant's units")
+    input_units: tuple[float, ...] = setting(
+        (), "unit of each state that is not an angle, one number each; []: the plant's units"
+    )
     output_scale: float = setting(1.0, "factor of the last layer's initial weights")
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
@@ -141,29 +143,35 @@ class Search:
     balanced: bool = setting(False, "make the drawn noise exactly zero mean, unit covariance over the particles")
     aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
     discount: float = setting(1.0, "weight of a later step against the one before")
-    cost: str = setting("matched", "expected one of the matched Gaussian, or of each of the particles: particles")
+    cost: str = setting(
+        "matched", "matched: expected cost of the matched Gaussian; particles: mean cost of the particles"
+    )
     refine: float = setting(
-        0.0, "last part of a search: refines what it found or the old policy, and ends with the best it had"
+        0.0, "last part of a search, as a fraction, which refines the better of the new policy and the old one"
     )
     widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
-    anneal: int = setting(1, "so many trials' searches are one to widen and decay, which end then; 1: each is its own")
+    anneal: int = setting(1, "trials over which widen= and decay= run down once; 1: in every search")
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
-    limit: float | None = setting(None, "a particle's gradient by its state that is longer is dropped; null: none is")
+    limit: float | None = setting(
+        None, "drop a particle's gradient with respect to its state where it is longer; null: never"
+    )
     reheat: float = setting(
-        0.0, "step size each search after `anneal` starts from and falls, as a fraction; 0: it stays"
+        0.0, "after `anneal` trials: step size at the start of each search, as a fraction; 0: constant"
     )
     loosen: float = setting(1.0, "factor of the limit in the searches that are reheated")
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(
-        True, "start a search from a fresh policy where that costs less than the old one, or the last search was stale"
+        True, "start from a fresh policy if it costs less than the old one, or the last search found nothing better"
     )
     anew: bool = setting(
         False, "start every search from a fresh policy; the old one is refined if none better is found"
     )
     starts: int = setting(1, "policies searched side by side, the best of which goes on: the old one and fresh ones")
-    sensors: str = setting("predicted", "noise on what the policy sees: as the model predicts, or the plant's: known")
+    sensors: str = setting(
+        "predicted", "noise on what the policy sees: predicted (by the model) or known (the plant's)"
+    )
     policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
     cost_noise: float = setting(0.0, "factor of the predicted noise on what the cost sees")

@@ -215,11 +215,15 @@ def learned(rows: Sequence[dict[str, Any]]) -> str:
     return f"policy {'kept' if kept else 'now'}: {', '.join(parts)}" if parts else ""
 
 
-def best_line(row: dict[str, Any]) -> str:
-    """The row of the trial whose policy is the best, as a sentence."""
-    measured = row["mean_cost"] is not None
-    known = f"success {row['success_rate']:.0%}, cost {row['mean_cost']:.3f}" if measured else "not evaluated"
-    return f"best policy: trial {row['trial']} ({known})"
+def best_line(rows: Sequence[dict[str, Any]], trial: int) -> str:
+    """The trial with the best policy of a run, and what its evaluation, or else its own episodes, say of it."""
+    row = rows[trial - 1]
+    own = [other["episode_cost"] for other in rows if other.get("policy") == trial]
+    if row["mean_cost"] is not None:
+        known = f"success {row['success_rate']:.0%}, cost {row['mean_cost']:.3f}"
+    else:
+        known = f"cost {np.mean(own):.3f} in {len(own)} of the episodes" if own else "not run yet"
+    return f"best policy: trial {trial} ({known})"
 
 
 def _mean(rows: Sequence[dict[str, Any]], name: str) -> float | None:
