@@ -149,7 +149,7 @@ def _train(words: Sequence[str]) -> None:
         runs = record.seeds_of(home)
         first = record.existing(next(iter(runs.values()), home))
         mjcf = rest.pop("mjcf", None)
-        config = restore.moved(settings.load(first / "config.yaml"), mjcf)
+        config = restore.moved(first, settings.load(first / "config.yaml"), mjcf)
         config = settings.override(config, settings.values(rest))
         restore.announce(first, config)
         runs = runs or {config.seed: home}
