@@ -172,13 +172,18 @@ def test_a_model_that_was_moved_is_known_by_its_content(tmp_path: Path, monkeypa
     words = {"task": "mjcf", "mjcf": str(tmp_path / "arm.xml"), "cost": "up:cost", "dt": "0.05", "horizon": "6"}
     config = settings.parse(words)
     run = a_run(tmp_path / "run", made=tasks.of_config(config), **words)
-    (tmp_path / "arm.xml").rename(tmp_path / "new.xml")
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "arm.xml").rename(tmp_path / "elsewhere" / "new.xml")
     kept = settings.load(run / "config.yaml")
     with pytest.raises(RunError, match="is not there; mjcf=FILE says where it is now"):
-        restore.planted(run, kept)
-    assert restore.planted(run, restore.moved(kept, "new.xml")).name == "arm"
-    (tmp_path / "new.xml").write_text(ARM.replace('mass="1"', 'mass="2"'))
+        restore.moved(run, kept)
+    now = restore.moved(run, kept, "elsewhere/new.xml")
+    assert restore.planted(run, now).name == "arm"
+    shutil.copy(tmp_path / "elsewhere" / "new.xml", tmp_path / "elsewhere" / "arm.xml")
+    monkeypatch.chdir(tmp_path / "elsewhere")  # where its name is found
+    assert restore.planted(run, restore.moved(run, kept)).name == "arm"
+    (tmp_path / "elsewhere" / "new.xml").write_text(ARM.replace('mass="1"', 'mass="2"'))
     with pytest.raises(RunError, match="its mjcf_digest was"):
-        restore.planted(run, restore.moved(kept, "new.xml"))
+        restore.planted(run, now)
     with pytest.raises(SettingError, match="of no use here"):
-        restore.moved(settings.parse({"task": "cartpole"}), "new.xml")
+        restore.moved(run, settings.parse({"task": "cartpole"}), "new.xml")

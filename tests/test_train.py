@@ -3,6 +3,7 @@
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -43,6 +44,11 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     done = call("train", *TINY, f"out={run}", cwd=run.parent)
     assert done.returncode == 0, done.stderr
     return run
+
+
+def timeless(run: Path) -> list[dict[str, object]]:
+    """The rows of a run without what the clock says."""
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in record.trials(run)]
 
 
 def copy_until(whole: Path, run: Path, trial: int) -> Path:
@@ -125,7 +131,8 @@ def test_killed_and_resumed_is_bit_equal(whole: Path, tmp_path: Path, moment: st
         awaited
     )  # an episode once collected is never collected again
     assert fingerprint(run) == fingerprint(whole)
-    assert [row["trial"] for row in record.trials(run)] == [1, 2, 3]
+    assert timeless(run) == timeless(whole)
+    assert not [path for path in run.rglob(".*") if path.name != ".lock"]
 
 
 def test_an_episode_on_disk_takes_the_place_of_the_plant(whole: Path, tmp_path: Path) -> None:
@@ -181,6 +188,55 @@ def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_pa
         assert other is not None
         np.testing.assert_array_equal(one.x, other.x)
     assert call("evaluate", str(run), cwd=tmp_path).returncode == 0
+
+
+@pytest.mark.parametrize("lines", [[], [0, 2], [0, 0, 1, 2]], ids=["gone", "a row less", "a row twice"])
+def test_rows_that_were_lost_are_found_again(lines: list[int], whole: Path, tmp_path: Path) -> None:
+    """That is said; the trials are done again, from the episodes, with the same result."""
+    run = copy_until(whole, tmp_path / "run", 9)
+    rows = (run / "trials.jsonl").read_text().splitlines(keepends=True)
+    (run / "trials.jsonl").write_text("".join(rows[i] for i in lines))
+    drawn = call("plot", run, cwd=tmp_path)
+    assert (drawn.returncode, drawn.stderr.count("\n")) == (2, 1)
+    assert "trials.jsonl" in drawn.stderr or "no finished trial" in drawn.stderr
+    done = call("train", f"resume={run}", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "trials.jsonl" in done.stderr
+    assert "there were 3 trials" in done.stderr
+    assert timeless(run) == timeless(whole)
+    assert fingerprint(run) == fingerprint(whole)
+
+
+def test_a_file_that_the_disk_refuses_ends_the_command_in_one_line(whole: Path, tmp_path: Path) -> None:
+    """A limit on the size of files stops the first checkpoint; without it the run goes on."""
+    command = shlex.join([*program("train"), *TINY, "out=run"])
+    places = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    done = subprocess.run(
+        ["sh", "-c", f"ulimit -f 8; {command}"], cwd=tmp_path, env=places, capture_output=True, text=True
+    )
+    assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
+    assert (
+        "run/checkpoints/0001/state.npz: File too large; every finished episode is kept" in done.stderr.splitlines()[-1]
+    )
+    done = call("train", "resume=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert fingerprint(tmp_path / "run") == fingerprint(whole)
+    assert timeless(tmp_path / "run") == timeless(whole)
+
+
+def test_the_policy_of_a_trial_is_evaluated(whole: Path, tmp_path: Path) -> None:
+    rows = record.trials(whole)
+    best = record.best_trial(rows)
+    for asked, trial in (("trial=1", 1), ("trial=best", best), ("trial=last", 3)):
+        done = call("evaluate", whole, asked, "episodes=1", "json=true", cwd=tmp_path)
+        assert json.loads(done.stdout)["trial"] == trial, done.stderr
+    for asked, says in (
+        ("trial=7", "choose from 1, 2, 3, best, last"),
+        ("trial=worst", "expected a number, best or last"),
+    ):
+        done = call("evaluate", whole, asked, cwd=tmp_path)
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+        assert says in done.stderr
 
 
 def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:

@@ -217,7 +217,7 @@ def _train(words: Sequence[str]) -> None:
     if "resume" in options:
         from pegasus_jax import restore
 
-        config = restore.moved(config, mjcf)
+        config = restore.moved(first, config, mjcf)
         restore.announce(first, config)
     else:
         config = pinned(config)

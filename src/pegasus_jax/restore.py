@@ -46,7 +46,7 @@ def ready(run: Path, trial: Trial = LAST, mjcf: str | None = None) -> tuple[Conf
 
     `mjcf` is where the model's file is now, if it is not where it was.
     """
-    config = moved(settings.load(record.existing(run) / "config.yaml"), mjcf)
+    config = moved(run, settings.load(record.existing(run) / "config.yaml"), mjcf)
     set_precision(config)
     return restored(run, trial, planted(run, config))
 
@@ -166,13 +166,21 @@ def planted(run: Path, config: Config) -> Task:
     return task._replace(name=record.task_of(run).name)
 
 
-def moved(config: Config, mjcf: str | None) -> Config:
-    """The config with the model's file where it is now; that it is the same one is seen when it is read."""
-    if mjcf is None:
-        return config
-    if config.task != tasks.MJCF:
+def moved(run: Path, config: Config, mjcf: str | None = None) -> Config:
+    """The config with the model's file where it is now: `mjcf`, where it was, or of that name in the working folder.
+
+    That it is the same model is seen when it is read. Raises RunError, or SettingError for a task without such a file.
+    """
+    if mjcf is not None and config.task != tasks.MJCF:
         raise SettingError(f"mjcf={mjcf} is of no use here: the run is of task={config.task}")
-    return replace(config, mjcf=os.path.abspath(mjcf))
+    if mjcf is None and (config.task != tasks.MJCF or config.mjcf is None or Path(config.mjcf).is_file()):
+        return config
+    file = Path(mjcf or Path(config.mjcf or "").name)
+    if mjcf is None and not file.is_file():
+        raise RunError(f"mjcf={config.mjcf}, with which {run} began, is not there; mjcf=FILE says where it is now")
+    if mjcf is None:
+        print(f"{config.mjcf} is not there; reading {file.absolute()}", file=sys.stderr)
+    return replace(config, mjcf=os.path.abspath(file))
 
 
 def same(run: Path, task: Task) -> None:
@@ -195,8 +203,6 @@ def announce(run: Path, config: Config) -> None:
             if file.resolve().is_relative_to(inside):
                 raise RunError(f"{module} would be imported from {file}, in {run}; nothing is imported from there")
         print(f"importing {module} from {files[-1] if files else 'nowhere'}", file=sys.stderr)
-    if config.task == tasks.MJCF and not Path(config.mjcf or "").is_file():
-        raise RunError(f"mjcf={config.mjcf}, with which {run} began, is not there; mjcf=FILE says where it is now")
 
 
 def _files(module: str) -> list[Path]:
