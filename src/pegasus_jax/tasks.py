@@ -9,7 +9,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from pegasus_envs import mjcf
+from pegasus_envs import mjcf, mjcf_check
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.goals import Task as Manoeuvre
@@ -260,6 +260,15 @@ def readings(config: Config, resets: int) -> np.ndarray:
     with user_code.blamed(f"env={config.env} cannot be reset"):
         found = [np.asarray(_environment(config).reset(seed=seed)[0], float) for seed in range(resets)]
     return np.stack(found)
+
+
+def compared(config: Config, task: Task) -> None:
+    """Raises SettingError, in one line, where MJX does not simulate a task's MJCF file as MuJoCo does."""
+    if config.task == MJCF:
+        try:
+            mjcf_check.compare(task.plant)
+        except ValueError as error:
+            raise SettingError(f"mjcf={config.mjcf}: {error}") from error
 
 
 def described(config: Config) -> dict[str, str]:
