@@ -47,6 +47,7 @@ SIBLINGS: set[tuple[str, str]] = {
     ("pilco", "search"),  # and one report of how a search went
     ("lbfgs", "fit"),  # what every fit reports
     ("policy.external", "policy.squash"),  # every controller saturates the same ways
+    *((f"policy.{kind}", "policy.scaled") for kind in ("mlp", "linear", "rbf")),  # large inputs, the same way
     ("noisy", "network"),  # the one network, with noise on its units
     ("mechanics", "network"),  # a mechanism's energies are that network
     ("mechanics_kernel", "mechanics"),  # the same equations, where they are compiled by hand

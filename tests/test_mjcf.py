@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pegasus_envs import mjcf
+from pegasus_envs import mjcf, mjcf_check
 from pegasus_envs.render import frames
 from pegasus_jax import record, settings, tasks
 from pegasus_jax.checks import SettingError
@@ -160,6 +160,9 @@ def test_bad_settings_are_one_line(changes: dict[str, object], message: str) -> 
         ({"geom": 'fluidshape="ellipsoid"'}, "MJX ignores fluidshape"),
         ({"motor": MOTOR + "<nonsense/>"}, "MuJoCo cannot read it"),
         ({"density": '1000" integrator="implicit'}, "MJX cannot simulate it"),
+        ({"density": '1000" noslip_iterations="3'}, "MJX ignores noslip_iterations"),
+        ({"density": '1000" actuatorgroupdisable="0'}, "MJX ignores actuatorgroupdisable"),
+        ({"motor": MOTOR.replace("/>", ' delay="0.05" nsample="20"/>')}, "MJX ignores delay of an actuator"),
     ],
 )
 def test_files_that_cannot_be_are_one_line(parts: dict[str, str], message: str, tmp_path: Path) -> None:
@@ -169,3 +172,47 @@ def test_files_that_cannot_be_are_one_line(parts: dict[str, str], message: str, 
         tasks.of_config(config(path, dt=0.02))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def arm(path: Path, **parts: str) -> mjcf.Mechanism:
+    """The arm of a file with these parts, whatever MJX ignores of it."""
+    path.write_text(ARM.format(**{"density": "1000", "geom": "", "motor": MOTOR} | parts))
+    return mjcf.mechanism(mujoco.MjModel.from_xml_path(str(path)), 0.02, start_std=[0.1])
+
+
+def test_flags_that_change_nothing_are_cleared(tmp_path: Path) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        ARM.format(
+            density='1000"><flag energy="enable" fwdinv="enable"/></option><option density="1000', geom="", motor=MOTOR
+        )
+    )
+    assert mjcf.read(path).opt.enableflags == 0
+
+
+def test_what_mjx_simulates_as_mujoco_does_is_let_through(pendulum: mjcf.Mechanism, tmp_path: Path) -> None:
+    mjcf_check.compare(pendulum)
+    mjcf_check.compare(arm(tmp_path / "arm.xml"))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"motor": MOTOR.replace("/>", ' delay="0.02" nsample="20"/>')},
+        {"density": '1000" actuatorgroupdisable="0'},
+        {"geom": 'fluidshape="ellipsoid" density="100"', "density": '1000" viscosity="5'},
+    ],
+)
+def test_another_physics_is_seen_by_comparing(parts: dict[str, str], tmp_path: Path) -> None:
+    """Also without knowing what it is that MJX ignores."""
+    made = arm(tmp_path / "arm.xml", **parts)
+    assert mjcf.ignored(made.model)
+    with pytest.raises(ValueError, match=r"does not simulate it as MuJoCo does: elbow.* differs in \d+ of 20"):
+        mjcf_check.compare(made)
+
+
+def test_a_simulation_that_breaks_down_is_not_learned_from(tmp_path: Path) -> None:
+    motor = '<position joint="elbow" kp="1e7" ctrllimited="true" ctrlrange="-1 1"/>'
+    with pytest.raises(ValueError, match=r"not stable: it breaks down in period \d+ of"):
+        mjcf_check.compare(arm(tmp_path / "arm.xml", motor=motor, density='0" timestep="0.02'))
+    assert not Path("MUJOCO_LOG.TXT").exists()

@@ -89,7 +89,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_robot_moves_for_the_episodes_that_are_data_and_for_nothing_else(learned: Path) -> None:
-    """One reset to check it, a reset and a horizon of steps a trial; looking at the run does not even open it."""
+    """One reset to check it, a reset and a horizon of steps a trial; going on opens it again, a look at the run not."""
     trial = ["reset", *["step"] * 5]
     assert asked(learned) == ["reset", *trial, *trial, "close"]
     rows = record.trials(learned / "run")

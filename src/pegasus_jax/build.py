@@ -26,6 +26,7 @@ from pegasus_jax.noisy import HEADS
 from pegasus_jax.policy.linear import linear
 from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.rbf import rbf
+from pegasus_jax.policy.scaled import inherited
 from pegasus_jax.policy.squash import SQUASHES, to_limits
 from pegasus_jax.population import best_of
 from pegasus_jax.rollout import NoiseUse, rollout
@@ -190,7 +191,8 @@ def search_of(
     if search.starts > 1:
         lasting = search.anneal > 1  # one course for all searches: who began late would be behind
         window = 1 if search.refine else max(1, search.steps // 20)  # what refines may end with another than its last
-        searcher = best_of(searcher, policy.init, starts=search.starts, window=window, lasting=lasting)
+        fresh = lambda key, given: inherited(policy.init(key), given)  # noqa: E731
+        searcher = best_of(searcher, fresh, starts=search.starts, window=window, lasting=lasting)
     # A refined policy is good for particles, not for their Gaussian.
     seen_last = match if refine is None else moments.keep
     return searcher, partial(imagined, **pieces, match=seen_last, blocks=blocks, task=task)

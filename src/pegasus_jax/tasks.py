@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from pegasus_envs import mjcf
+from pegasus_envs import mjcf, mjcf_check
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.gym_plant import EnvSpec, env_plant, env_spec, make_env, starts
@@ -171,6 +171,15 @@ def readings(config: Config, task: Task, resets: int) -> np.ndarray:
         return np.zeros((0, len(task.state_names)))
     with user_code.blamed(f"env={config.env} cannot be reset"):
         return starts(config.env or "", config.env_args, resets)
+
+
+def compared(config: Config, task: Task) -> None:
+    """Raises SettingError, in one line, where MJX does not simulate a task's MJCF file as MuJoCo does."""
+    if config.task == MJCF:
+        try:
+            mjcf_check.compare(task.plant)
+        except ValueError as error:
+            raise SettingError(f"mjcf={config.mjcf}: {error}") from error
 
 
 def described(config: Config) -> dict[str, str]:

@@ -15,6 +15,7 @@ from pegasus_jax.fit import FitInfo
 from pegasus_jax.search import SearchInfo
 from pegasus_jax.types import (
     Array,
+    Dataset,
     Dynamics,
     Episode,
     Experiment,
@@ -159,6 +160,9 @@ def experiment(
         learner, info = fit.run(trial_key(state.key, state.trial, FIT), state.model, state.data, steps)
         return state._replace(model=learner), info
 
+    def adapted(params: Params, data: Dataset) -> Params:
+        return params if policy.adapt is None else policy.adapt(params, data)
+
     def improve_policy(
         state: RunState, first: Array | int = 0, steps: int = search_steps
     ) -> tuple[RunState, SearchInfo]:
@@ -169,9 +173,18 @@ def experiment(
         earlier = search_steps * jnp.maximum(state.trial - max(1, explore_trials), 0) if search_goes_on else 0
         # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
         # that knows nothing is the better start.
-        fresh = policy.init(trial_key(state.key, state.trial, RESTART)) if search_restart else None
+        fresh = adapted(policy.init(trial_key(state.key, state.trial, RESTART)), state.data) if search_restart else None
+        untrained = (state.trial <= max(1, explore_trials)) & (first == 0)
+        given = optax.tree.where(untrained, adapted(state.policy.params, state.data), state.policy.params)
         learner, info = search.run(
-            key, state.policy, belief, first=first, earlier=earlier, steps=steps, rival=fresh, reset=search_reset
+            key,
+            state.policy._replace(params=given),
+            belief,
+            first=first,
+            earlier=earlier,
+            steps=steps,
+            rival=fresh,
+            reset=search_reset,
         )
         return state._replace(policy=learner), info
 

@@ -116,6 +116,8 @@ class Policy(NamedTuple):
     apply: Callable[[Params, Params, Array], Array]  # (params, noise or None: the mean policy, x [D]) -> u [U]
     # (params, mean [F], cov of the encoded state) -> gaussian.Image of the control; None: not known
     moments: Callable[[Params, Array, Array], Any] | None = None
+    # (fresh params, data) -> params that take the data's large entries in their own units; None: not needed
+    adapt: Callable[[Params, Dataset], Params] | None = None
 
 
 class Task(NamedTuple):
