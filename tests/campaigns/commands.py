@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from tests.campaigns import common
-from tests.campaigns.command_kinds import Command, chosen
-from tests.campaigns.common import SMALL, Outcome
+from tests.campaigns.command_kinds import BASE, Command, chosen
+from tests.campaigns.common import RUN, Outcome
 
 HERE = Path(__file__).parent
 # What lies in the folder that a command works in, beside a run.
@@ -49,8 +49,8 @@ def one(case: tuple[int, Command], folder: Path) -> dict[str, Any]:
     ended = common.command(command.name, *command.words, cwd=home, limit=command.limit)
     wrong = judged(command, ended)
     shutil.rmtree(home)
-    words = " ".join(word if len(word) < 60 else f"{word[:40]}... ({len(word)} letters)" for word in command.words)
-    words = words.removeprefix(" ".join(SMALL))
+    words = [word for word in command.words if word not in BASE]
+    words = " ".join(word if len(word) < 60 else f"{word[:40]}... ({len(word)} letters)" for word in words)
     told = [f"{command.name} {words}: {wrong} (status {ended.status}; {common.last_line(ended.err)})"] if wrong else []
     return {"wrong": wrong, "status": ended.status, "problems": told}
 
@@ -68,7 +68,7 @@ def run(folder: Path, cases: int, seed: int, jobs: int) -> dict[str, Any]:
             shutil.copy(HERE / name, home / name)
         for name, text in FILES.items():
             (home / name).write_text(text)
-        ended = common.command("pegasus-train", *SMALL, "trials=1", "out=run", cwd=home, limit=300)
+        ended = common.command("pegasus-train", *RUN, "out=run", cwd=home, limit=300)
         assert not ended.status, ended.err
     commands = [command for command in chosen(cases, seed) if common.entry(command.name) is not None]
     rows = common.shared(list(enumerate(commands)), lambda case: one(case, folder), jobs)

@@ -22,10 +22,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: a process th
 ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
 # The smallest run that writes every kind of file.
-SMALL = (
-    "task=cartpole model=log_normal model.hidden=[8] policy.hidden=[8] fit.steps=5 fit.batch=20"
-    " search.steps=5 search.particles=10 evaluation=1"
-).split()
+SMALL = [
+    *("task=cartpole", "model=log_normal", "model.hidden=[8]", "policy.hidden=[8]", "fit.steps=5", "fit.batch=20"),
+    *("search.steps=5", "search.particles=10"),
+]
+TRIALS = 3
+RUN = [*SMALL, f"trials={TRIALS}", "evaluation=1"]
 
 
 class Outcome(NamedTuple):
@@ -61,8 +63,8 @@ def prepare(folder: Path) -> None:
 
 def load() -> None:
     """Import what commands need, so that forked children need not. JAX must not start its threads here."""
-    import matplotlib.pyplot
-    import orbax.checkpoint
+    import matplotlib.pyplot  # noqa: F401
+    import orbax.checkpoint  # noqa: F401
     import tensorboardX  # noqa: F401
 
     import pegasus_envs.gym  # noqa: F401
@@ -76,7 +78,7 @@ def load() -> None:
 
 
 def entry(name: str) -> Callable[[], None] | None:
-    """The function behind a console script of the project, as pyproject.toml names it; None for one it does not have."""
+    """The function behind a console script of the project, as pyproject.toml names it; None where there is none."""
     import importlib
     import tomllib
 
@@ -125,6 +127,8 @@ def _be_child(work: Callable[[], Any], out: int, err: int) -> None:
         null = os.open(os.devnull, os.O_RDONLY)
         for target, source in ((0, null), (1, out), (2, err)):
             os.dup2(source, target)
+        # A test may hold the others.
+        sys.stdout, sys.stderr = (os.fdopen(file, "w", closefd=False) for file in (1, 2))
         work()
         code = 0
     except SystemExit as end:
@@ -200,10 +204,11 @@ def options(defaults: dict[str, Any]) -> dict[str, Any]:
 
 
 def campaign(name: str, run: Callable[..., dict[str, Any]], cases: int, **more: Any) -> None:
-    """A campaign's command: runs it in a folder of its own, writes its JSON, prints its table; status 1 on a finding."""
+    """A campaign's command: runs it, writes its JSON, prints its figures; status 1 when it found something."""
     defaults = dict(cases=cases, seed=0, jobs=2, out=str(RESULTS / f"campaign-{name}.json"), folder="") | more
     chosen = options(defaults)
-    folder = Path(chosen.pop("folder") or tempfile.mkdtemp(prefix=f"campaign-{name}-")).absolute()
+    given = chosen.pop("folder")
+    folder = Path(given or tempfile.mkdtemp(prefix=f"campaign-{name}-")).absolute()
     folder.mkdir(parents=True, exist_ok=True)
     out, began = Path(chosen.pop("out")), time.monotonic()
     prepare(folder)
@@ -212,12 +217,10 @@ def campaign(name: str, run: Callable[..., dict[str, Any]], cases: int, **more: 
     result |= {"command": asked, "minutes": round((time.monotonic() - began) / 60, 1)}
     out.parent.mkdir(parents=True, exist_ok=True)
     out.write_text(json.dumps(result, indent=1) + "\n")
-    from tests.campaigns.table import rows
-
-    print(rows(name, result))
+    print("\n".join(f"{value!s:>8}  {what}" for what, value in result["figures"].items()))
     for problem in result["problems"][:40]:
         print(f"- {problem}")
-    if not result["problems"]:
+    if not (result["problems"] or given):
         shutil.rmtree(folder, ignore_errors=True)  # else it stays, to look at
     sys.exit(bool(result["problems"]))
 

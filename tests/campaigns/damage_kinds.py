@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-Change = Callable[[Path, Path], object]  # (path of the file, folder of the campaign)
+Change = Callable[[Path], object]  # of the path
 
 
 class Damage(NamedTuple):
@@ -24,11 +23,11 @@ class Damage(NamedTuple):
     other_end: bool = False
     """whether a resume may rightly end in another way"""
 
-    def do(self, run: Path, folder: Path) -> None:
+    def do(self, run: Path) -> None:
         """Damage the copy."""
         parent, _, name = self.path.rpartition("/")
         found = sorted((run / parent).glob(name)) if "*" in name else [run / self.path]
-        self.change(found[0], folder)
+        self.change(found[0])
 
     def outside(self, home: Path) -> bool:
         """Whether a file outside the run, to which a link of it points, was written to."""
@@ -39,13 +38,13 @@ class Damage(NamedTuple):
 OUTSIDE = "somebody else's file\n"
 
 
-def gone(path: Path, _: Path) -> None:
+def gone(path: Path) -> None:
     shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
 
 
 def filled(content: bytes) -> Change:
-    def change(path: Path, folder: Path) -> None:
-        gone(path, folder)
+    def change(path: Path) -> None:
+        gone(path)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(content)
 
@@ -53,7 +52,7 @@ def filled(content: bytes) -> Change:
 
 
 def edited(edit: Callable[[bytes], bytes]) -> Change:
-    return lambda path, _: path.write_bytes(edit(path.read_bytes()))
+    return lambda path: path.write_bytes(edit(path.read_bytes()))
 
 
 def flipped(where: float) -> Change:
@@ -64,14 +63,14 @@ def flipped(where: float) -> Change:
     return edited(edit)
 
 
-def folder_there(path: Path, folder: Path) -> None:
-    gone(path, folder)
+def folder_there(path: Path) -> None:
+    gone(path)
     path.mkdir(parents=True)
 
 
-def linked_outside(path: Path, folder: Path) -> None:
+def linked_outside(path: Path) -> None:
     """A link to a file beside the run, which nobody may write to through it."""
-    gone(path, folder)
+    gone(path)
     run = next(parent for parent in path.parents if parent.name == "run")
     outside = run.parent / "outside"
     outside.write_text(OUTSIDE)
@@ -79,18 +78,18 @@ def linked_outside(path: Path, folder: Path) -> None:
     path.symlink_to(outside)
 
 
-def loop(path: Path, folder: Path) -> None:
-    gone(path, folder)
+def loop(path: Path) -> None:
+    gone(path)
     path.symlink_to(path.name)
 
 
 def copied(suffix: str) -> Change:
     """A copy beside it, as file managers make them."""
-    return lambda path, _: shutil.copyfile(path, path.with_name(f"{path.stem}{suffix}{path.suffix}"))
+    return lambda path: shutil.copyfile(path, path.with_name(f"{path.stem}{suffix}{path.suffix}"))
 
 
 def swapped(other: str) -> Change:
-    def change(path: Path, _: Path) -> None:
+    def change(path: Path) -> None:
         first, second = path.read_bytes(), path.with_name(other).read_bytes()
         path.write_bytes(second)
         path.with_name(other).write_bytes(first)
@@ -98,15 +97,10 @@ def swapped(other: str) -> Change:
     return change
 
 
-def of_donor(name: str) -> Change:
-    """The same file of another run."""
-    return lambda path, folder: path.write_bytes((folder / "donor" / name).read_bytes())
-
-
 def arrays(edit: Callable[[dict[str, np.ndarray]], object]) -> Change:
     """An .npz file with other arrays: `edit` changes the dictionary."""
 
-    def change(path: Path, _: Path) -> None:
+    def change(path: Path) -> None:
         with np.load(path) as file:
             held = {name: file[name] for name in file.files}
         edit(held)
@@ -125,7 +119,7 @@ def holed(array: np.ndarray, value: float) -> np.ndarray:
     return array
 
 
-def npy(path: Path, _: Path) -> None:
+def npy(path: Path) -> None:
     with path.open("wb") as file:
         np.save(file, np.zeros(3))
 
@@ -142,7 +136,7 @@ def replaced(old: str, new: str) -> Change:
     return edited(edit)
 
 
-def unreadable(path: Path, _: Path) -> None:
+def unreadable(path: Path) -> None:
     """Mode 0; nothing to root."""
     path.chmod(0)
 
@@ -152,7 +146,7 @@ WAYS: dict[str, Change] = {
     "emptied": filled(b""),
     "cut in half": edited(lambda content: content[: len(content) // 2]),
     "last byte gone": edited(lambda content: content[:-1]),
-    "garbage": filled(os.urandom(0) + bytes(range(255, -1, -1)) * 3),
+    "garbage": filled(bytes(range(255, -1, -1)) * 3),
     "zeroed": edited(lambda content: bytes(len(content))),
     "bit flipped at .2": flipped(0.2),
     "bit flipped at .5": flipped(0.5),
@@ -207,7 +201,7 @@ def others() -> list[Damage]:
     sums = json.dumps({"../../../outside": "0" * 64}).encode()
     return [
         Damage(second, "swapped with 3", swapped("0003.npz")),
-        Damage(third, "the one of trial 2", lambda path, _: shutil.copyfile(path.with_name("0002.npz"), path)),
+        Damage(third, "the one of trial 2", lambda path: shutil.copyfile(path.with_name("0002.npz"), path)),
         Damage(third, "says that it is of trial 9", trial_9),
         Damage(third, "says that it is another task's", task),
         Damage(third, "copied", copied(" (copy)")),
@@ -215,11 +209,13 @@ def others() -> list[Damage]:
         Damage("checkpoints/0002.json", "copied", copied(" (copy)")),
         Damage("checkpoints/0002.json", "copied as a number", copied(".5")),
         Damage("checkpoints/0002.json", "sums of a file outside", filled(sums)),
-        Damage("checkpoints/0002.json", "sums of trial 1", of_donor("checkpoints/0001.json")),
+        Damage(
+            "checkpoints/0002.json", "sums of trial 1", lambda path: shutil.copyfile(path.with_name("0001.json"), path)
+        ),
         Damage("config.yaml", "another width of the model", replaced("- 8", "- 9")),
         Damage("config.yaml", "another task", replaced("task: cartpole", "task: double_cartpole")),
-        Damage("config.yaml", "an unknown key", lambda path, _: path.write_text(path.read_text() + "unknown: 1\n")),
-        Damage("config.yaml", "twice the same key", lambda path, _: path.write_text(path.read_text() + "seed: 1\n")),
+        Damage("config.yaml", "an unknown key", lambda path: path.write_text(path.read_text() + "unknown: 1\n")),
+        Damage("config.yaml", "twice the same key", lambda path: path.write_text(path.read_text() + "seed: 1\n")),
         Damage("config.yaml", "a word for a number", replaced("trials: 3", "trials: three")),
         Damage("config.yaml", "fewer trials", replaced("trials: 3", "trials: 1")),
         Damage("config.yaml", "an environment variable", replaced("trials: 3", "trials: ${oc.env:HOME}")),

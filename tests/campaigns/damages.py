@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.campaigns import common
-from tests.campaigns.common import SMALL, Outcome
+from tests.campaigns.common import RUN, Outcome
 from tests.campaigns.damage_kinds import DAMAGES, Damage
 from tests.campaigns.kills import fingerprint, rows_of
 
@@ -23,13 +23,10 @@ COMMANDS = ("eval", "plot", "resume")
 
 
 def made(folder: Path) -> None:
-    """The folders that damages are done to: `base`, and `donor`, another seed's run whose files are put in its place."""
-    for name, seed in (("base", 0), ("donor", 1)):
-        run = folder / name
-        if not (run / "config.yaml").exists():
-            words = [*SMALL, f"seed={seed}", "trials=3", f"out={run}"]
-            ended = common.command("pegasus-train", *words, cwd=folder, limit=300)
-            assert not ended.status, ended.err
+    """The run that damages are done to, `base`, and how it ends, `end`."""
+    if not (folder / "base" / "config.yaml").exists():
+        ended = common.command("pegasus-train", *RUN, "out=base", cwd=folder, limit=300)
+        assert not ended.status, ended.err
     if not (folder / "end").exists():
         ended = common.command("pegasus-plot", "base", cwd=folder)
         assert not ended.status, ended.err
@@ -81,7 +78,7 @@ def one(case: tuple[int, Damage], folder: Path, right: str) -> dict[str, Any]:
         run = home / "run"
         shutil.rmtree(home, ignore_errors=True)
         shutil.copytree(folder / "base", run)
-        damage.do(run, folder)
+        damage.do(run)
         ended = called(what, run)
         wrong = judged(damage, run, what, ended, right)
         found["refused" if ended.status == 2 else "went on"] += 1

@@ -92,10 +92,6 @@ def complex_number(x):
 
 
 number = 0.5
-COSTS = (
-    "in_numpy in_math branches of_two of_none nothing text pair raises leaves asserts missing_key vector reward"
-    " no_gradient constant never_finite gradient_nan beyond_the_end complex_number number absent sys.exit"
-).split()
 
 
 class OldReset(Arm):

@@ -19,11 +19,9 @@ from pathlib import Path
 from typing import Any
 
 from tests.campaigns import common
-from tests.campaigns.common import SMALL, Outcome
+from tests.campaigns.common import RUN, TRIALS, Outcome
 
 MODES = ("before", "after", "half", "full")  # in the order of interpose.c
-TRIALS = 4
-WORDS = [*SMALL, f"trials={TRIALS}"]
 STARTING = 20  # operations before a first trial, at least
 A_RUN = 10  # kills of one run, at most
 SOURCE = Path(__file__).with_name("interpose.c")
@@ -56,7 +54,7 @@ def counted(run: Path, *words: str, at: int = 0, mode: str = "before", **limits:
 
 def go_on(run: Path) -> list[str]:
     """The words that go on with a run, or begin it when it was killed before it was one."""
-    return [f"resume={run}"] if (run / "config.yaml").exists() else [*WORDS, f"out={run}"]
+    return [f"resume={run}"] if (run / "config.yaml").exists() else [*RUN, f"out={run}"]
 
 
 def episodes(run: Path) -> dict[str, tuple[bytes, int]]:
@@ -148,9 +146,9 @@ def run(folder: Path, cases: int, seed: int, jobs: int, disks: int) -> dict[str,
     whole = folder / "whole"
     if not (whole / "fingerprint").exists():
         shutil.rmtree(whole, ignore_errors=True)
-        counted(whole, *WORDS, f"out={whole}", limit=300)  # fills the cache
+        counted(whole, *RUN, f"out={whole}", limit=300)  # fills the cache
         shutil.rmtree(whole)
-        ended, log = counted(whole, *WORDS, f"out={whole}")
+        ended, log = counted(whole, *RUN, f"out={whole}")
         assert not ended.status, ended.err
         unseen = [path.name for path in whole.rglob("*") if not any(path.name in line for line in log)]
         (whole / "operations").write_text(str(len(log)))

@@ -24,15 +24,27 @@ import numpy as np
 from tests.campaigns import common
 
 ROBOTS = Path(__file__).with_name("robots.py")
-TINY = (
-    "task=gym cost=robots:cost angles=[0] start_mean=[3.14,0] start_std=[.05,.05] model.hidden=[8] policy.hidden=[8]"
-    " search.particles=16 fit.steps=5"
-).split()
+TINY = [
+    *("task=gym", "cost=robots:cost", "angles=[0]", "start_mean=[3.14,0]", "start_std=[.05,.05]", "fit.steps=5"),
+    *("model.hidden=[8]", "policy.hidden=[8]", "search.particles=16"),
+]
 SIGNALS = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129, "SIGINT twice": 130}
 MOMENTS = ("import", "compile", "search", "episode", "episode", "episode", "evaluate")
 CLOSE = 1.0  # seconds that `close` may take
 GRACE = 0.05  # seconds in which a control that was on its way may begin
-ROBOT_KINDS = ("Arm", "Arm", "Slow", "Alarms", "Bound", "InJax", "Buffer", "InPlace", "CloseRaises", "Handlers", "Swallows")
+ROBOT_KINDS = (
+    "Arm",
+    "Arm",
+    "Slow",
+    "Alarms",
+    "Bound",
+    "InJax",
+    "Buffer",
+    "InPlace",
+    "CloseRaises",
+    "Handlers",
+    "Swallows",
+)
 
 
 class Case(NamedTuple):
@@ -57,7 +69,12 @@ def words(case: Case) -> list[str]:
     """What pegasus-train is called with, so that there is time for the stop."""
     long = 200_000 if case.moment == "search" else 5
     episodes = 30 if case.moment == "evaluate" else 0
-    chosen = [f"env=robots:{case.robot}-v0", f"horizon={case.horizon}", f"search.steps={long}", f"evaluation={episodes}"]
+    chosen = [
+        f"env=robots:{case.robot}-v0",
+        f"horizon={case.horizon}",
+        f"search.steps={long}",
+        f"evaluation={episodes}",
+    ]
     return [*TINY, *chosen, "trials=3", "out=run"]
 
 
@@ -85,7 +102,12 @@ def started(case: Case, folder: Path, fails: int) -> subprocess.Popen[str]:
     told = {**os.environ, "ROBOT_LOG": str(folder / "robot.log"), "ROBOT_FAILS": str(fails)}
     if case.moment == "compile":
         told |= {"XDG_CACHE_HOME": str(folder / "cache"), "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
-    program = [sys.executable, "-P", "-c", "import sys; sys.path.insert(0, ''); from pegasus_jax.cli import train; train()"]
+    program = [
+        sys.executable,
+        "-P",
+        "-c",
+        "import sys; sys.path.insert(0, ''); from pegasus_jax.cli import train; train()",
+    ]
     pipes = dict(stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     return subprocess.Popen([*program, *words(case)], cwd=folder, env=told, **pipes)  # type: ignore[call-overload]
 
@@ -168,7 +190,14 @@ def one(case: Case, folder: Path) -> dict[str, Any]:
     return {"latency": latency, "wrong": wrong, "problems": problems}
 
 
-WRONG = ("ended before it was stopped", "close too late", "controls after the stop", "exit status", "traceback", "rows lost")
+WRONG = (
+    "ended before it was stopped",
+    "close too late",
+    "controls after the stop",
+    "exit status",
+    "traceback",
+    "rows lost",
+)
 
 
 def run(folder: Path, cases: int, seed: int, jobs: int) -> dict[str, Any]:
