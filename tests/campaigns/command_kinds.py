@@ -57,8 +57,12 @@ def misspelt() -> list[Command]:
     words = words_of(
         "serach.steps=5 searchsteps=5 search=5 fit.=5 .steps=5 fit.steps.x=5 Trials=3 trials:3 --trials=3 --trials"
         " -v =3 = task model= policy= algorithm=fastest task=cartpol model=gpp policy=mpl mesh=2 mesh=0x1 mesh=1x"
-        " seeds=0 seeds=-1 seeds=two resume= resume=nothing resume=. distributed=maybe coordinator=here process=1 out=/proc/x"
-        " out=/dev/null seeds=" + HUGE + " mesh=" + HUGE + "x1 legs=4 legs=6 env=Pendulum-v1 mjcf=arm.xml horizon=40"
+        " seeds=0 seeds=-1 seeds=two resume= resume=nothing resume=. distributed=maybe coordinator=here process=1"
+        " out=/proc/x out=/dev/null seeds="
+        + HUGE
+        + " mesh="
+        + HUGE
+        + "x1 legs=4 legs=6 env=Pendulum-v1 mjcf=arm.xml horizon=40"
         " dt=.1 angles=[0] rates=[1] observe=[qpos.0] control_low=[-1] start_mean=[0] cost=robots:cost precision=half"
     )
     return [train(word, refused=True) for word in words]

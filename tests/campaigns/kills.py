@@ -110,7 +110,7 @@ def one_run(case: dict[str, Any], folder: Path, operations: int) -> dict[str, An
         else:
             ended, log = counted(run, *go_on(run), at=at, mode=mode)
         told = f"run {case['seed']}, {mode} of operation {log[-1] if log else 'none'}"
-        delivered[mode] += ended.status != 0
+        delivered[mode] += ended.status != 0 if mode == "full" else ended.status == -9
         kept = episodes(run)
         found["episodes lost or rewritten"] += sum(kept.get(name) != content for name, content in before.items())
         if ended.traceback or not (ended.status in (0, -9) or (mode == "full" and ended.refusal)):
@@ -162,10 +162,12 @@ def run(folder: Path, cases: int, seed: int, jobs: int, disks: int) -> dict[str,
             dict(seed=seed + len(rows) + i, kills=min(A_RUN, cases - kills), disks=bool(disks)) for i in range(wanted)
         ]
         rows += common.shared(runs, lambda case: one_run(case, folder, operations), jobs)
-        kills = sum(sum(row["delivered"].values()) for row in rows)
+        kills = sum(count for row in rows for mode, count in row["delivered"].items() if mode != "full")
     delivered, found = (sum((Counter(row[name]) for row in rows), Counter()) for name in ("delivered", "found"))
-    ways = ", ".join(f"{delivered[mode]} {mode}" for mode in (*MODES, "time"))
-    figures = {"runs taken to their end": len(rows), f"kills ({ways})": kills} | {what: found[what] for what in WRONG}
+    ways = zip(("before", "after", "half", "time"), ("before", "after", "in the middle of", "at any time"), strict=True)
+    told = ", ".join(f"{delivered[mode]} {way}" for mode, way in ways)
+    figures = {"runs taken to their end": len(rows), f"kills ({told}; an operation)": kills}
+    figures |= {"stopped by a full disk": delivered["full"]} | {what: found[what] for what in WRONG}
     return {"figures": figures, "problems": [problem for row in rows for problem in row["problems"]]}
 
 
