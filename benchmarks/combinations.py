@@ -21,7 +21,7 @@ from benchmarks.timing import compiled, in_turn, matmul
 from benchmarks.workloads import ALIKE
 from pegasus_jax import settings
 from pegasus_jax.build import build, set_precision
-from pegasus_jax.record import about
+from pegasus_jax.machine import about
 from pegasus_jax.variants import MODELS, POLICIES
 
 STEPS, PRODUCTS = 4, 500  # in one call

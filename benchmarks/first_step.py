@@ -59,7 +59,7 @@ def main(words: list[str]) -> None:
     """The command line of this module."""
     from benchmarks.study import RESULTS  # here: what this module imports, the measured process waits for
     from pegasus_jax import settings
-    from pegasus_jax.record import about, processors
+    from pegasus_jax.machine import about, processors
 
     options, rest = settings.split(words, ("repeats",))
     train = [f"{key}={value}" for key, value in ({"task": "cartpole"} | rest).items()]

@@ -24,7 +24,7 @@ from benchmarks.timing import compiled, in_turn, matmul, summary
 from benchmarks.workloads import ALIKE
 from pegasus_jax import dataset, settings
 from pegasus_jax.build import build, set_precision
-from pegasus_jax.record import about
+from pegasus_jax.machine import about
 from pegasus_jax.types import Batch, Dataset, Trajectory
 
 PILCO = {"policy": "rbf", "algorithm": "pilco"}

@@ -4,7 +4,7 @@
 
 Learns for two short trials on an environment that answers at once and notes when it is called. Writes
 benchmarks/results/latency.json: microseconds (median, 99th percentile, most) between the return of the environment's
-`step` and its next call, and of one call of `deploy.controller`.
+`step` and its next call, and of one call of `controller`.
 """
 
 import json
@@ -20,9 +20,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.study import RESULTS
-from pegasus_jax import settings, tasks
-from pegasus_jax.deploy import controller
-from pegasus_jax.record import about
+from pegasus_jax import controller, settings, tasks
+from pegasus_jax.machine import about
 from pegasus_jax.train import train
 
 TINY = {"fit.steps": "20", "search.steps": "20", "horizon": "200", "trials": "2", "evaluation": "5"}

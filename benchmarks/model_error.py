@@ -23,7 +23,7 @@ from pegasus_jax.angles import difference
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.calibration import one_step_errors, overconfidence
 from pegasus_jax.config import Config
-from pegasus_jax.record import about
+from pegasus_jax.machine import about
 from pegasus_jax.types import Array, Key, RunState, Task, Trajectory
 
 TESTS = 20

@@ -22,7 +22,8 @@ from typing import Any
 
 from benchmarks.study import RESULTS, seed_list
 from pegasus_jax import settings
-from pegasus_jax.record import about, trials
+from pegasus_jax.machine import about
+from pegasus_jax.record import trials
 from pegasus_jax.sweep import PROGRAM
 
 Slots = SimpleQueue[set[int] | None]

@@ -29,8 +29,7 @@ from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames
 from pegasus_envs.swimmer import swimmer
 from pegasus_jax import settings
-from pegasus_jax.record import existing
-from pegasus_jax.train import newest
+from pegasus_jax.restore import ready
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 
@@ -78,7 +77,7 @@ def plants() -> None:
 
 def swing_up(run: Path, path: Path, shown: int = 9) -> None:
     """Frames of one evaluation episode of a run's newest policy, side by side."""
-    _, experiment, state = newest(existing(run))
+    _, experiment, state = ready(run)
     episode = jax.jit(experiment.episode)(jax.random.key(1), state.policy.params, jnp.asarray(False))
     plant = experiment.task.plant
     times = np.linspace(0, experiment.task.horizon, shown).round().astype(int)

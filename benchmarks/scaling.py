@@ -33,8 +33,8 @@ from benchmarks.workloads import ALIKE, workload
 from pegasus_jax import mesh, settings
 from pegasus_jax.build import build, compose, set_precision
 from pegasus_jax.config import Config
+from pegasus_jax.machine import about
 from pegasus_jax.program import LASTING, Jitted, compiler_options, over_seeds, placed
-from pegasus_jax.record import about
 from pegasus_jax.trial import EVALUATE, trial_key
 from pegasus_jax.types import Array, Experiment, RunState
 

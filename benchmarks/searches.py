@@ -22,8 +22,8 @@ from benchmarks.study import RESULTS
 from pegasus_jax import settings
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.config import Config
+from pegasus_jax.machine import about
 from pegasus_jax.program import LASTING, compiler_options
-from pegasus_jax.record import about
 from pegasus_jax.study import seed_list
 from pegasus_jax.trial import trial
 from pegasus_jax.types import Array, RunState

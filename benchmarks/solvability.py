@@ -19,7 +19,7 @@ from benchmarks.feedback import GAINS, ROLL, episodes
 from benchmarks.study import RESULTS
 from pegasus_envs.swimmer import swimmer
 from pegasus_jax import settings
-from pegasus_jax.record import about
+from pegasus_jax.machine import about
 
 COLUMNS = ("mean_square", "roll", "pitch", "yaw", "depth", "rate")
 """mean |e|^2 of 20 s, all terms unweighted; over the last 10 s: RMSE of roll (of roll rate for the corkscrew), pitch,

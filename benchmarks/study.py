@@ -10,8 +10,8 @@ import sys
 from pathlib import Path
 
 from pegasus_jax import settings
+from pegasus_jax.machine import about
 from pegasus_jax.program import share_processors
-from pegasus_jax.record import about
 from pegasus_jax.study import seed_list, study, table, write
 
 RESULTS = Path(__file__).parent / "results"

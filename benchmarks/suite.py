@@ -25,7 +25,7 @@ from benchmarks.workloads import SIZES, Workload, flop, workload
 from pegasus_jax import settings
 from pegasus_jax.build import build
 from pegasus_jax.config import Config
-from pegasus_jax.record import about, processors
+from pegasus_jax.machine import about, processors
 
 RESULTS = Path(__file__).parent / "results"
 STEPS, FIT_STEPS, PRODUCTS = 10, 100, 500  # steps, and products, in one timed run

@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import compare, scaling, searches, timing
 from benchmarks.workloads import SIZES, flop, products, workload
-from pegasus_jax import record, settings
+from pegasus_jax import machine, settings
 from probes import unchecked
 
 TINY = {
@@ -47,7 +47,7 @@ def test_a_run_fails_when_a_shared_row_is_slower_by_the_limit(new, fails, tmp_pa
 
 
 def test_runs_on_two_processors_are_compared_and_that_is_said(tmp_path, capsys):
-    here = record.about("make bench")
+    here = machine.about("make bench")
     assert here["processor"]
     there = {**here, "processor": "another"}
     new = run(tmp_path / "new.json", here, a=10)
@@ -98,8 +98,8 @@ def test_every_size_can_be_asked_for(name):
 def test_two_processors_of_one_name_are_told_apart(monkeypatch):
     for family, said in (("25", "AMD EPYC, family 25, model 17"), ("26", "AMD EPYC, family 26, model 17")):
         known = {"flags": "sse", "model": "17", "cpu family": family, "model name": "AMD EPYC"}
-        monkeypatch.setattr(record, "processor", lambda known=known: known)
-        assert record.about("")["processor"] == said
+        monkeypatch.setattr(machine, "processor", lambda known=known: known)
+        assert machine.about("")["processor"] == said
 
 
 @pytest.mark.parametrize(

@@ -14,20 +14,24 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
-    0: "types checks config variants",
+    0: "types checks config config_models variants defaults interrupt",
     1: "angles mesh quantile dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout"
-    " episode calibration",
-    2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco",
+    " episode calibration user_code",
+    2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco cost_check",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",
-    6: "checkpoint compiled record report. cli deploy program progress settings sweep train study __main__ __init__",
+    6: "board cache check checkpoint deployed facts files machine record report. restore cli program progress settings"
+    " sweep train study __main__ __init__",
 }
 TOP = max(LAYERS)  # the layer that is an application: here modules may import each other, without cycles
 
 # (importer, imported), both of one layer below TOP.
 SIBLINGS: set[tuple[str, str]] = {
+    ("config_models", "checks"),
+    ("config", "config_models"),  # the settings of the models are its
     ("config", "checks"),  # a setting is checked when it is made
+    ("defaults", "config"),  # what a task changes in them; a folder's name is made of them
     ("variants", "config"),  # a variant is made of settings
     ("dropout", "quantile"),  # uniform draws, and what makes a truncated normal of them
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap

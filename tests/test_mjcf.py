@@ -18,6 +18,7 @@ from pegasus_envs.render import frames
 from pegasus_jax import record, settings, tasks
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
+from pegasus_jax.defaults import label
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
 PENDULUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "inverted_pendulum.xml"
@@ -116,7 +117,7 @@ def test_a_file_is_known_by_its_content() -> None:
 
 def test_folders_tell_tasks_apart() -> None:
     labels = [
-        tasks.label(made)
+        label(made)
         for made in (
             config("some/arm.xml"),
             Config(task="gym", env="package:ns/Pendulum-v1"),
@@ -138,6 +139,8 @@ def test_folders_tell_tasks_apart() -> None:
         ({"observe": ("tip",)}, "choose from qpos.0"),
         ({"control_low": (1.0, 2.0)}, "control_low has 2 entries; expected 1"),
         ({"control_low": (5.0,)}, "control_low=5 must be less than control_high=3"),
+        ({"dt": 2000.0}, "dt=2000 is 100000 of its time steps; the most is dt=200"),
+        ({"start_mean": (0.1,)}, "start_mean has 1 entries; expected 4"),
         ({"start_mean": (1.0, 2.0)}, "start_mean has 2 entries; expected 4"),
         ({"angles": (4,)}, "choose from 0 to 3"),
         ({"cost": "math:nothing"}, "cost=math:nothing cannot be imported"),

@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pegasus_jax import machine, record
 from pegasus_jax import program as programs
-from pegasus_jax import record
 from pegasus_jax.build import compose
 from pegasus_jax.program import Program, over_seeds
 from probes import EMITTERS, cart, tiny, unchecked
@@ -115,7 +115,7 @@ def test_how_it_is_compiled_changes_no_result() -> None:
 def test_the_cores_of_a_processor_share_the_seeds(study: Path) -> None:
     """Two of them for two seeds; on a machine of one there is nothing to share."""
     devices = json.loads((study / "seed1" / "run.json").read_text())["devices"]
-    assert len(devices) == min(2, record.processors())
+    assert len(devices) == min(2, machine.processors())
 
 
 @pytest.mark.parametrize(
@@ -132,7 +132,7 @@ print(sum("XLAEigen" in path.read_text() for path in pathlib.Path("/proc/self/ta
 """
     environment = {k: v for k, v in os.environ.items() if k not in ("NPROC", "XLA_FLAGS", "JAX_NUM_CPU_DEVICES")}
     found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert int(found.stdout) == (threads or record.processors())
+    assert int(found.stdout) == (threads or machine.processors())
 
 
 def test_killed_and_resumed_is_bit_equal(study: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from pegasus_jax import checkpoint, record, settings
-from pegasus_jax.train import newest
+from pegasus_jax.restore import restored
 
 # A run of seconds: the model that compiles soonest, the smallest networks and searches that go through every part.
 TINY = ["task=cartpole", "model=log_normal", "trials=3", "model.hidden=[16]", "policy.hidden=[8]"]
@@ -31,7 +32,7 @@ def call(name: str, *words: object, cwd: Path, **env: str) -> subprocess.Complet
 
 def fingerprint(run: Path) -> str:
     """Of the newest state; in this process, because a command would take most of the time of these tests."""
-    _, _, state = newest(run)
+    _, _, state = restored(run)
     return checkpoint.fingerprint(state)
 
 
@@ -132,7 +133,7 @@ def test_an_episode_on_disk_takes_the_place_of_the_plant(whole: Path, tmp_path: 
     run = copy_until(whole, tmp_path / "run", 1)
     other = record.load_episode(whole, 3)
     assert other is not None
-    np.savez(run / "episodes" / "0002.npz", **other._asdict())
+    record.save_episode(run, 2, other, record.task_of(run), policy=1, ended="horizon")
     assert call("train", f"resume={run}", cwd=tmp_path).returncode == 0
     used = record.load_episode(run, 2)
     assert used is not None
@@ -160,13 +161,17 @@ def test_all_checkpoints_damaged_starts_from_the_episodes(whole: Path, tmp_path:
 
 
 def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_path: Path) -> None:
-    """As those of an older version may be, whose optimiser kept other things. Resuming begins with the data."""
+    """As those of an older version may be, whose model was another. Resuming begins with the data."""
     run = copy_until(whole, tmp_path / "run", 2)
-    config = run / "config.yaml"
-    config.write_text(config.read_text().replace("search.best: false", "search.best: true"))
+    config = settings.load(run / "config.yaml")
+    settings.save(settings.override(config, {"model.hidden": [17]}), run / "config.yaml")
     refused = call("evaluate", str(run), cwd=tmp_path)
     assert refused.returncode == 2
-    assert "no checkpoint that this version can use" in refused.stderr.splitlines()[-1]
+    assert "no checkpoint that this version can use" in refused.stderr
+    assert re.search(
+        r"model.params\S+ is float32 \[.*16.*\], and these settings make it float32 \[.*17", refused.stderr
+    )
+    assert refused.stderr.count("\n") == 1
     done = call("train", f"resume={run}", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "of another version or of other settings" in done.stderr

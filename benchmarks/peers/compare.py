@@ -29,7 +29,7 @@ from benchmarks.peers import of_mc_pilco, of_prob_mbrl, plain_torch
 from benchmarks.timing import compiled, in_turn, own_products, summary
 from benchmarks.workloads import SIZES, Workload, goal, workload
 from pegasus_jax import settings
-from pegasus_jax.record import about
+from pegasus_jax.machine import about
 
 RESULTS = Path(__file__).parents[1] / "results"
 STEPS, FIT_STEPS = 10, 100  # in one timed run

@@ -19,6 +19,7 @@ from pegasus_envs.physics import mjx
 from pegasus_envs.plant import FRAME, draw_start, filled
 
 _ENTRY = re.compile(r"(qpos|qvel)\.(\d+)")
+LONGEST = 10_000  # time steps of a control period
 _UNITS = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
 
 
@@ -84,8 +85,10 @@ def mechanism(
     if count < 1 or abs(count * model.opt.timestep - dt) > 1e-6 * dt:
         near = max(count, 1) * model.opt.timestep
         raise ValueError(f"dt={dt:g} is not a whole number of its time steps of {model.opt.timestep:g} s; try {near:g}")
+    if count > LONGEST:
+        raise ValueError(f"dt={dt:g} is {count} of its time steps; the most is dt={LONGEST * model.opt.timestep:g}")
     rest = np.concatenate([model.qpos0, np.zeros(model.nv)])
-    mean = filled("start_mean", start_mean, len(entries), rest[entries])
+    mean = filled("start_mean", start_mean, len(entries), rest[entries], each=True)
     std = filled("start_std", start_std, len(entries), np.zeros(len(entries)))
     device, blank = _on_device(model)
 

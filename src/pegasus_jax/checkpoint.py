@@ -1,4 +1,4 @@
-"""RunState on disk: orbax writes the arrays, a SHA-256 list beside them tells a damaged checkpoint from a whole one."""
+"""RunState on disk: its arrays by name, and a list of SHA-256 that tells a damaged checkpoint from a whole one."""
 
 import hashlib
 import json
@@ -11,8 +11,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax.record import RunError, write_json
+from pegasus_jax.checks import RunError
+from pegasus_jax.files import write_json, write_whole
+from pegasus_jax.record import arrays, numbered
 from pegasus_jax.types import Key, RunState
+
+STATE = "state.npz"
 
 
 def save(run: Path, trial: int, state: RunState) -> None:
@@ -20,22 +24,24 @@ def save(run: Path, trial: int, state: RunState) -> None:
     path = _folder(run, trial)
     _sums(run, trial).unlink(missing_ok=True)
     shutil.rmtree(path, ignore_errors=True)
-    with _checkpointer() as checkpointer:
-        checkpointer.save(path, jax.tree.map(np.asarray, _plain(state)))  # of the host: any devices can read it back
+    leaves = {name: np.asarray(leaf) for name, leaf in _named(_plain(state)).items()}
+    write_whole(path / STATE, lambda file: np.savez(file, **leaves))  # type: ignore[arg-type]
     write_json(_sums(run, trial), {str(f.relative_to(path)): _digest(f) for f in _files(path)})
 
 
 def available(run: Path) -> list[int]:
     """Trials with a checkpoint, newest first."""
-    return sorted((int(p.stem) for p in (run / "checkpoints").glob("[0-9]*.json")), reverse=True)
+    return numbered(run / "checkpoints", ".json")[::-1]
 
 
 def damage(run: Path, trial: int) -> str | None:
     """What is wrong with a checkpoint, naming the file, or None when it is whole."""
     path = _folder(run, trial)
     try:
-        sums = json.loads(_sums(run, trial).read_text())
+        sums = json.loads(_sums(run, trial).read_bytes())
     except (OSError, ValueError):
+        sums = None
+    if not isinstance(sums, dict) or not sums:
         return f"{_sums(run, trial)} is missing or unreadable"
     for name, digest in sums.items():
         file = path / name
@@ -49,15 +55,57 @@ def damage(run: Path, trial: int) -> str | None:
 def restore(run: Path, trial: int, like: RunState) -> RunState:
     """The state after a trial; `like` is a state of the same experiment (shapes are enough: eval_shape of init).
 
-    Raises RunError when it is the state of another experiment, or of a version that kept other things.
+    The data may have fewer rows than in `like`. An optimiser is None where it is that of other settings. Raises
+    RunError, naming the difference, when the rest is the state of another experiment or version.
     """
-    target = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), jax.eval_shape(_plain, like))
-    try:
-        with _checkpointer() as checkpointer:
-            state = jax.tree.map(jnp.asarray, checkpointer.restore(_folder(run, trial), target))
-    except ValueError as error:
-        raise RunError(f"{_folder(run, trial)} is of another version or of other settings") from error
-    return state._replace(key=jax.random.wrap_key_data(state.key))
+    folder, like = _folder(run, trial), jax.eval_shape(_plain, like)
+    stored = arrays(folder / STATE)
+    optimizers = {"model": like.model.optimizer, "policy": like.policy.optimizer}
+    rest = like._replace(model=like.model._replace(optimizer=None), policy=like.policy._replace(optimizer=None))
+    if difference := _difference(stored, _named(rest)):
+        raise RunError(f"{folder} is of another version or of other settings: {difference}")
+    state = _filled(stored, rest)
+    kept = {
+        name: _filled(stored, tree, f"{name}.optimizer.") if _suits(stored, tree, f"{name}.optimizer.") else None
+        for name, tree in optimizers.items()
+    }
+    return state._replace(
+        key=jax.random.wrap_key_data(state.key),
+        model=state.model._replace(optimizer=kept["model"]),
+        policy=state.policy._replace(optimizer=kept["policy"]),
+    )
+
+
+def _named(tree: Any, prefix: str = "") -> dict[str, Any]:
+    """Name -> leaf of a tree, as `model.params.network.kernel`."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return {prefix + jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def _difference(stored: dict[str, Any], expected: dict[str, Any]) -> str | None:
+    """The first leaf that is missing, or has another shape or type than expected, in words."""
+    rows = {stored[name].shape[:1] for name in stored if name in ("data.x", "data.u", "data.y")}
+    for name, leaf in expected.items():
+        if name not in stored:
+            return f"it has no {name}"
+        found, shape = stored[name], leaf.shape
+        if name in ("data.x", "data.u", "data.y") and len(rows) == 1 and (found.shape[:1] or (-1,)) <= shape[:1]:
+            shape = (*found.shape[:1], *shape[1:])
+        if (found.shape, found.dtype) != (shape, leaf.dtype):
+            return f"{name} is {found.dtype} {list(found.shape)}, and these settings make it {leaf.dtype} {list(shape)}"
+    extra = [name for name in stored if name not in expected and ".optimizer" not in name]
+    return f"it has {extra[0]} too" if extra else None
+
+
+def _suits(stored: dict[str, Any], tree: Any, prefix: str) -> bool:
+    """Whether the stored leaves below a prefix are those of this tree, in name, shape and type."""
+    expected = {name: (leaf.shape, leaf.dtype) for name, leaf in _named(tree, prefix).items()}
+    return expected == {name: (leaf.shape, leaf.dtype) for name, leaf in stored.items() if name.startswith(prefix)}
+
+
+def _filled(stored: dict[str, Any], tree: Any, prefix: str = "") -> Any:
+    """The tree with its leaves from the stored ones."""
+    return jax.tree.unflatten(jax.tree.structure(tree), [jnp.asarray(stored[name]) for name in _named(tree, prefix)])
 
 
 def fingerprint(state: RunState) -> str:
@@ -70,17 +118,6 @@ def fingerprint(state: RunState) -> str:
     return digest.hexdigest()
 
 
-def _checkpointer() -> Any:
-    """One that waits for no other process: each reads for itself, and one alone writes."""
-    import orbax.checkpoint as ocp  # here: it takes .2 s, and a run needs it after its first trial
-
-    own = jax.process_index()
-    alone = ocp.options.MultiprocessingOptions(
-        primary_host=own, active_processes={own}, barrier_sync_key_prefix=f"process{own}"
-    )
-    return ocp.StandardCheckpointer(multiprocessing_options=alone)
-
-
 def _plain(state: RunState) -> RunState:
     """The state with its typed key as the raw words that files can hold."""
     key: Key = state.key
@@ -88,7 +125,7 @@ def _plain(state: RunState) -> RunState:
 
 
 def _folder(run: Path, trial: int) -> Path:
-    return run.absolute() / "checkpoints" / f"{trial:04d}"
+    return run / "checkpoints" / f"{trial:04d}"
 
 
 def _sums(run: Path, trial: int) -> Path:

@@ -12,9 +12,9 @@ import numpy as np
 
 from pegasus_jax import settings
 from pegasus_jax.build import build
-from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.checks import RunError, SettingError, nearest
 from pegasus_jax.config import Config
-from pegasus_jax.record import RunError, about
+from pegasus_jax.machine import about
 from pegasus_jax.report.curves import areas_picture, picture
 from pegasus_jax.report.figures import Figure
 from pegasus_jax.study import seed_list, study, write

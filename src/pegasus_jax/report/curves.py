@@ -12,7 +12,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from scipy.stats import bootstrap, trim_mean
 
-from pegasus_jax.record import RunError, trials
+from pegasus_jax.checks import RunError
+from pegasus_jax.files import write_whole
+from pegasus_jax.record import trials
 
 
 def seeds_picture(runs: Sequence[Path], path: Path) -> Path:
@@ -42,7 +44,7 @@ def picture(
     bottom.set(ylabel="success rate", xlabel="plant time [s]")
     top.legend(frameon=False)
     figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=110))
     plt.close(figure)
 
 
@@ -77,7 +79,7 @@ def areas_picture(
     )
     axis.grid(axis="y", alpha=0.25)
     figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=110))
     plt.close(figure)
 
 

@@ -12,7 +12,9 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from pegasus_jax.record import RunError, load_episode, load_imagined, trials
+from pegasus_jax.checks import RunError
+from pegasus_jax.files import write_whole
+from pegasus_jax.record import load_episode, load_imagined, trials
 from pegasus_jax.types import Task
 
 REAL, IMAGINED = "#d1495b", "#30638e"
@@ -24,7 +26,8 @@ def run_pictures(run: Path, task: Task) -> list[Path]:
     if not rows:
         raise RunError(f"{run} has no finished trial yet")
     folder = run / "plots"
-    folder.mkdir(exist_ok=True)
+    if folder.is_symlink():  # what it points to may be anybody's
+        folder.unlink()
     paths = [folder / "learning.png"]
     learning(rows, paths[0])
     for row in rows:
@@ -66,7 +69,7 @@ def trajectories(run: Path, trial: int, fan: dict[str, np.ndarray], task: Task, 
     figure, axes = plt.subplots(-(-len(names) // columns), columns, figsize=(11, 2.4 * -(-len(names) // columns)))
     flat: list[Axes] = list(np.ravel(axes))
     imagined = [*np.moveaxis(fan["x"], -1, 0), *np.moveaxis(fan["u"], -1, 0), fan["cost"]]
-    actual = None if real is None else [*real.x.T, *real.u.T, real.cost]
+    actual = None if real is None else [*real.trajectory.x.T, *real.trajectory.u.T, real.trajectory.cost]
     for i, (axis, name) in enumerate(zip(flat, names, strict=False)):
         first = 1 if name == "cost" else 0
         _fan(axis, (first + np.arange(imagined[i].shape[0])) * task.dt, imagined[i])
@@ -91,5 +94,5 @@ def _fan(axis: Axes, time: np.ndarray, values: np.ndarray) -> None:
 
 def _save(figure: Any, path: Path) -> None:
     figure.tight_layout()
-    figure.savefig(path, dpi=110)
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=110))
     plt.close(figure)

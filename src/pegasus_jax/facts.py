@@ -1,0 +1,104 @@
+"""The facts of a task as JSON values: all of it but its plant, its cost and other code.
+
+They lie in a run's folder, so that whoever looks at the run needs neither a robot nor the files of its user.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pegasus_jax.checks import RunError
+
+if TYPE_CHECKING:
+    from pegasus_jax.types import Task
+
+TEXTS = ("state_names", "control_names")
+ENTRIES = ("angles", "rates")  # of the state
+STATE = ("start_mean", "start_std", "sensor_std")  # one number a state
+CONTROL = ("control_low", "control_high")  # one number a control
+NUMBERS = ("dt", "success", "stop_cost")
+
+
+def of_task(task: Task) -> dict[str, Any]:
+    """The facts of a task; of one made of an MJCF file also the SHA-256 of its compiled model."""
+    from pegasus_jax.tasks import mjcf_digest
+
+    digest = mjcf_digest(task)
+    return {
+        "name": task.name,
+        "horizon": int(task.horizon),
+        **{name: list(getattr(task, name)) for name in TEXTS},
+        **{name: [int(entry) for entry in getattr(task, name)] for name in ENTRIES},
+        **{name: np.asarray(getattr(task, name), float).tolist() for name in (*STATE, *CONTROL)},
+        **{name: float(getattr(task, name)) for name in NUMBERS},
+        **({} if digest is None else {"mjcf_digest": digest}),
+    }
+
+
+def to_task(found: Any, where: str) -> Task:
+    """The task of such facts, without a plant; its cost raises RunError. So do facts that are none; `where` is said."""
+    try:
+        states, controls = len(found["state_names"]), len(found["control_names"])
+        known = {
+            "name": _text(found["name"]),
+            "horizon": _whole(found["horizon"], 1, 10**9),
+            **{name: tuple(map(_text, found[name])) for name in TEXTS},
+            **{name: tuple(_whole(entry, 0, states - 1) for entry in found[name]) for name in ENTRIES},
+            **{name: _numbers(found[name], states) for name in STATE},
+            **{name: _numbers(found[name], controls) for name in CONTROL},
+            **{name: float(_numbers([found[name]], 1)[0]) for name in NUMBERS},
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise RunError(f"{where} is damaged: its task has no usable {str(error) or 'facts'}") from error
+    from pegasus_jax.types import Task
+
+    return Task(plant=None, cost=unknown_cost, widened=lambda _: (unknown_cost, unknown_cost), **known)
+
+
+def unknown_cost(*_: Any) -> Any:
+    """Raises RunError: what was read from a folder has no cost."""
+    raise RunError("the cost of this task is code of its user, which was not imported; pegasus-eval imports it")
+
+
+def difference(stored: dict[str, Any], made: dict[str, Any]) -> str | None:
+    """In what two tasks differ, in words, or None. A model that was only renamed is the same one."""
+    moved = {"name"} if "mjcf_digest" in stored and stored["mjcf_digest"] == made.get("mjcf_digest") else set()
+    for name in sorted({*stored, *made} - moved, key=lambda name: name != "mjcf_digest"):
+        one, other = stored.get(name), made.get(name)
+        if not _same(one, other):
+            return f"its {name} was {_short(one)} and now is {_short(other)}"
+    return None
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Equal, or numbers that differ by rounding."""
+    if one == other or not all(isinstance(value, float | list) for value in (one, other)):
+        return one == other
+    both = [np.asarray(value) for value in (one, other)]
+    return all(a.dtype.kind in "fi" for a in both) and both[0].shape == both[1].shape and np.allclose(*both, rtol=1e-6)
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) < 60 else f"{text[:16]}..."
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str):
+        raise TypeError("texts")
+    return value
+
+
+def _whole(value: Any, low: int, high: int) -> int:
+    if type(value) is not int or not low <= value <= high:
+        raise TypeError("whole numbers")
+    return value
+
+
+def _numbers(values: Any, count: int) -> np.ndarray:
+    if len(values) != count or not all(type(v) in (int, float) and math.isfinite(v) for v in values):
+        raise TypeError("numbers")
+    return np.array(values, float)

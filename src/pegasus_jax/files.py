@@ -1,0 +1,60 @@
+"""Files that appear whole or not at all, with the mode that the user's umask gives every new file."""
+
+import json
+import math
+import os
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+
+def beside(path: Path) -> Path:
+    """A new name in the folder of `path`, `.NAME.RANDOM`, for the file that will take its place."""
+    return path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+
+
+def write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:
+    """Let `write` fill a file that then appears at `path` whole, and survives a power cut.
+
+    A symbolic link at `path` is replaced, not followed.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = beside(path)
+    handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)
+    try:
+        with os.fdopen(handle, "wb") as file:
+            write(file)
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    except BaseException as error:
+        temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename is None:  # such as a full disk
+            raise OSError(error.errno, error.strerror, str(path)) from error
+        raise
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def refused(error: OSError) -> str:
+    """What a file system refused, in one line that names the file."""
+    reason = error.strerror or " ".join(str(error).split()) or type(error).__name__
+    return f"{error.filename}: {reason}" if error.filename else reason
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write one JSON document, whole."""
+    write_whole(path, lambda file: file.write(json.dumps(strict(value), indent=1, allow_nan=False).encode() + b"\n"))
+
+
+def strict(value: Any) -> Any:
+    """The value with None for every number that JSON has no word for: NaN and the infinities."""
+    if isinstance(value, dict):
+        return {key: strict(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [strict(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,50 @@
+"""What a run was made with: versions, machine, processors."""
+
+import os
+import platform
+import sys
+from functools import cache
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+
+def processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def about(command: str) -> dict[str, Any]:
+    """Versions, machine and command: what somebody else needs to repeat the run."""
+    import jax
+
+    packages = ("pegasus-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+    versions = {}
+    for name in packages:
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return {
+        "command": command,
+        "python": sys.version.split()[0],
+        "platform": platform.platform(),
+        "processor": ", ".join(f"{label}{processor()[name]}" for name, label in NAMED.items() if name in processor()),
+        "devices": [str(device) for device in jax.devices()],
+        "versions": versions,
+    }
+
+
+# What tells processors apart: a virtual machine may call two generations by one name.
+NAMED = {"model name": "", "cpu family": "family ", "model": "model "}
+
+
+@cache
+def processor() -> dict[str, str]:
+    """What the system says of its first processor, at least its "model name"; on Linux also what it can execute."""
+    known = {"model name": f"{platform.machine()} {platform.processor()}"}
+    try:
+        lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+    except OSError:
+        return known
+    return known | {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}

@@ -1,0 +1,179 @@
+"""What lies in a run's folder, made usable again; and what of it is never executed."""
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from folders import a_run
+from pegasus_jax import checkpoint, record, restore, settings, tasks
+from pegasus_jax.build import build
+from pegasus_jax.checks import RunError, SettingError
+from test_train import call
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return a_run(tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture
+def run(made: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(made, tmp_path / "run"))
+
+
+def change(run: Path, **changes: object) -> None:
+    config = settings.load(run / "config.yaml")
+    settings.save(settings.override(config, {k.replace("__", "."): v for k, v in changes.items()}), run / "config.yaml")
+
+
+def test_the_facts_of_a_task_make_the_same_experiment(run: Path) -> None:
+    """As far as a policy and its model go: the same state, and the same functions of it."""
+    config, experiment, state = restore.restored(run)
+    real = build(config)
+    like = jax.eval_shape(real.init, jax.random.key(0))
+    assert jax.tree.structure(like) == jax.tree.structure(state)
+    x = np.array([0.1, 0.2, -0.3, 2.0], np.float32)
+    u, expected = (e.policy.apply(state.policy.params, None, x) for e in (experiment, real))
+    np.testing.assert_array_equal(u, expected)
+    assert restore.same(run, real.task) is None
+    with pytest.raises(RunError, match="its control_high was"):
+        restore.same(run, real.task._replace(control_high=np.array([11.0])))
+
+
+def test_a_state_of_other_settings_is_refused_with_the_difference(run: Path) -> None:
+    change(run, model__hidden=[4])
+    with pytest.raises(RunError, match=r"network.*is float32 \[3.*and these settings make it float32 \[4"):
+        restore.restored(run, 2)
+    with pytest.raises(RunError, match="no checkpoint that this version can use"):
+        restore.restored(run)
+    change(run, model__hidden=[3], task="double_cartpole")
+    with pytest.raises(RunError, match="is not what"):
+        restore.planted(run, settings.load(run / "config.yaml"))
+
+
+def test_another_optimiser_leaves_what_was_learned(run: Path) -> None:
+    _, _, before = restore.restored(run, 2)
+    change(run, search__best=True, trials=9)
+    _, experiment, state = restore.restored(run, 2)
+    assert state.policy.optimizer is None
+    assert state.model.optimizer is not None
+    assert checkpoint.fingerprint(state) == checkpoint.fingerprint(before)
+    whole = restore.suited(state, jax.jit(experiment.init)(jax.random.key(0)))
+    like = jax.eval_shape(experiment.init, jax.random.key(0))
+    assert jax.tree.structure(whole) == jax.tree.structure(like)
+
+
+def test_damaged_checkpoints_are_named(run: Path) -> None:
+    sums = run / "checkpoints" / "0003.json"
+    for content in ("", "[1]", "null", "{}", "3", '{"a": 1}'):
+        sums.write_text(content)
+        problem = checkpoint.damage(run, 3)
+        assert problem is not None
+        assert "\n" not in problem
+    sums.unlink()
+    sums.mkdir()
+    shutil.copy(run / "checkpoints" / "0002.json", run / "checkpoints" / "0003 (copy).json")
+    assert int(restore.restored(run)[2].trial) == 2
+    with pytest.raises(RunError, match=r"0003.json is missing or unreadable"):
+        restore.restored(run, 3)
+
+
+def test_a_run_goes_on_from_where_its_rows_end(run: Path) -> None:
+    """Rows that checkpoints prove are not lost: their trials are done again, and that is said."""
+    experiment = build(settings.load(run / "config.yaml"))
+    for lines, begins in (([0, 1, 2], 3), ([0, 1], 2), ([0, 2], 1), ([0, 0, 1, 2], 1), ([], None)):
+        whole = [json.dumps(row) for row in record.trials(run)]
+        (run / "trials.jsonl").write_text("".join(whole[i] + "\n" for i in lines))
+        said: list[str] = []
+        state = restore.together([run], experiment, said.append)
+        assert (None if state is None else int(state.trial[0])) == begins
+        assert len(said) == (begins != 3)
+        assert all("trials.jsonl" in line and "there were 3 trials" in line for line in said)
+        (run / "trials.jsonl").write_text("".join(line + "\n" for line in whole))
+
+
+def test_the_last_episode_counts_though_it_has_no_row(run: Path) -> None:
+    """The policy after the last trial is the best as soon as its own episode says so."""
+    assert restore.best(run) == 2
+    task, cheap = record.task_of(run), record.load_episode(run, 3)
+    assert cheap is not None
+    record.save_episode(run, 4, cheap._replace(cost=0.01 * cheap.cost), task, policy=3, ended="horizon")
+    assert restore.best(run) == 3
+    record.save_episode(run, 4, cheap._replace(cost=0.01 * cheap.cost), task, policy=3, ended="error")
+    assert restore.best(run) == 2
+
+
+def test_nothing_is_imported_from_inside_a_run(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither by the name of a folder below the working folder, nor through a path, nor from there."""
+    for folder in (run, run / "lib"):
+        folder.mkdir(exist_ok=True)
+        (folder / "evil.py").write_text("raise SystemExit('executed')")
+    config = settings.override(settings.load(run / "config.yaml"), {"task": "gym", "cost": "run.lib.evil:cost"})
+    monkeypatch.chdir(run.parent)
+    with pytest.raises(RunError, match="nothing is imported from there"):
+        restore.announce(Path("run"), config)
+    config = settings.override(config, {"cost": "evil:cost"})
+    restore.announce(run, config)
+    monkeypatch.syspath_prepend(run / "lib")
+    with pytest.raises(RunError, match="nothing is imported from there"):
+        restore.announce(run, config)
+    monkeypatch.undo()
+    monkeypatch.chdir(run)
+    with pytest.raises(RunError, match="nothing is imported from there"):
+        restore.announce(run, config)
+
+
+def test_a_hostile_folder_executes_nothing(run: Path) -> None:
+    """By the commands: a cost that would write a file, an environment's module that would, links, and a reference."""
+    (run / "evil.py").write_text("open('executed', 'w')\n")
+    config = (run / "config.yaml").read_text()
+    (run / "config.yaml").write_text(
+        config.replace("task: cartpole", "task: gym")
+        .replace("env: null", "env: run.evil:A-v0")
+        .replace("cost: null", "cost: run.evil:cost")
+    )
+    mine = run.parent / "mine"
+    mine.write_text("mine")
+    (run / "plots").mkdir()
+    (run / "plots" / "learning.png").symlink_to(mine)
+    assert call("plot", "run", cwd=run.parent).returncode == 0
+    for name, words in (("evaluate", ["run"]), ("play", ["run"]), ("train", ["resume=run"])):
+        done = call(name, *words, cwd=run.parent)
+        assert (done.returncode, "Traceback" in done.stderr) == (2, False), done.stderr
+        assert "nothing is imported from there" in done.stderr
+    assert mine.read_text() == "mine"
+    assert not list(run.parent.rglob("executed"))
+    (run / "config.yaml").write_text(config.replace("env: null", "env: ${oc.env:HOME}"))
+    for name, words in (("evaluate", ["run"]), ("train", ["resume=run"])):
+        done = call(name, *words, cwd=run.parent)
+        assert (done.returncode, done.stderr.count("\n"), "not a value but a reference" in done.stderr) == (2, 1, True)
+        assert os.environ["HOME"] not in (run / "config.yaml").read_text()
+
+
+ARM = """<mujoco><option timestep="0.01"/><worldbody><body><joint name="j" axis="0 1 0"/>
+<geom size=".1" fromto="0 0 0 0 0 1" type="capsule" mass="1"/></body></worldbody>
+<actuator><motor joint="j" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+def test_a_model_that_was_moved_is_known_by_its_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "arm.xml").write_text(ARM)
+    (tmp_path / "up.py").write_text("import jax.numpy as jnp\ncost = lambda x: 1 - jnp.exp(-x[0] ** 2)\n")
+    monkeypatch.chdir(tmp_path)
+    words = {"task": "mjcf", "mjcf": str(tmp_path / "arm.xml"), "cost": "up:cost", "dt": "0.05", "horizon": "6"}
+    config = settings.parse(words)
+    run = a_run(tmp_path / "run", made=tasks.of_config(config), **words)
+    (tmp_path / "arm.xml").rename(tmp_path / "new.xml")
+    kept = settings.load(run / "config.yaml")
+    with pytest.raises(RunError, match="is not there; mjcf=FILE says where it is now"):
+        restore.planted(run, kept)
+    assert restore.planted(run, restore.moved(kept, "new.xml")).name == "arm"
+    (tmp_path / "new.xml").write_text(ARM.replace('mass="1"', 'mass="2"'))
+    with pytest.raises(RunError, match="its mjcf_digest was"):
+        restore.planted(run, restore.moved(kept, "new.xml"))
+    with pytest.raises(SettingError, match="of no use here"):
+        restore.moved(settings.parse({"task": "cartpole"}), "new.xml")
