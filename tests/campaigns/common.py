@@ -58,7 +58,10 @@ def prepare(folder: Path) -> None:
     os.environ["XDG_CACHE_HOME"] = str(folder / "cache")
     os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")  # it compiles faster, to slower code
     os.environ["MPLBACKEND"] = "agg"
-    os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+    # JAX reads these when it is imported, which is before the children's commands can set them.
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = str(folder / "cache" / "programs")
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    (folder / "cache" / "programs").mkdir(mode=0o700, parents=True, exist_ok=True)
 
 
 def load() -> None:
