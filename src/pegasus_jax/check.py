@@ -34,7 +34,7 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
         task.success,
     )
     notes = cost_check.notes(task.cost, facts, f"cost={config.cost}")
-    readings = tasks.readings(config, resets) if config.task == tasks.GYM else facts.seen
+    readings = tasks.readings(config, task, resets)
     return [*notes, *plausible(readings, facts), *alike(readings, task.angles)]
 
 

@@ -77,7 +77,7 @@ def best(run: Path) -> int:
     following = len(rows) + 1
     ran, origin = record.load_episode(run, following), record.origin(run, following)
     last = None
-    if ran is not None and origin is not None and np.isfinite(ran.trajectory.cost).all():
+    if ran is not None and origin is not None and len(ran.trajectory.u) and np.isfinite(ran.trajectory.cost).all():
         last = {"policy": origin[0], "ended": ran.ended, **verdict(ran, record.task_of(run))}
     try:
         return record.best_trial(rows, last)
