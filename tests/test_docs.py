@@ -100,9 +100,10 @@ def tools(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         module, function = where.split(":")
         program = f"#!{sys.executable}\nimport sys\nfrom {module} import {function}\nsys.exit({function}())\n"
         (folder / "bin" / name).write_text(program)
-    (folder / "bin" / "python").symlink_to(sys.executable)
+    python = folder / "bin" / "python"  # not a link: it would not know its environment
+    python.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n')
     (folder / ".installed").touch()
-    for program in (folder / "bin").glob("pegasus-*"):
+    for program in (folder / "bin").iterdir():
         program.chmod(0o755)
     return {
         **os.environ,
