@@ -169,7 +169,12 @@ def judged(case: Case, folder: Path, seen: dict[str, Any]) -> tuple[float | None
     if (opened or case.moment != "import") and "Traceback" in seen["out"] + seen["err"]:
         wrong.append("traceback")
     done = sum(what == "stepped" for _, what in calls)
-    if case.moment == "episode" and rows_kept(folder / "run") < min(done, case.horizon):
+    # A second Ctrl-C ends at once: it closes the environment, and writes nothing more.
+    if (
+        case.moment == "episode"
+        and not case.how.endswith("twice")
+        and rows_kept(folder / "run") < min(done, case.horizon)
+    ):
         wrong.append("rows lost")
     return latency, wrong
 
