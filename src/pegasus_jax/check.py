@@ -35,7 +35,7 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     )
     notes = cost_check.notes(task.cost, facts, f"cost={config.cost}")
     tasks.compared(config, task)
-    readings = tasks.readings(config, resets)
+    readings = tasks.readings(config, task, resets)
     return [*notes, *plausible(readings, facts), *alike(readings, task.angles)]
 
 

@@ -253,13 +253,13 @@ def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarr
     return np.full(len(task.state_names), -np.inf), np.full(len(task.state_names), np.inf)
 
 
-def readings(config: Config, resets: int) -> np.ndarray:
+def readings(config: Config, task: Task, resets: int) -> np.ndarray:
     """What an environment observes after so many resets [N, D]; N is 0 for a simulation of our own.
 
     Raises SettingError, in one line, for what the environment raises.
     """
     if config.task != GYM:
-        return np.zeros((0, len(config.start_mean)))
+        return np.zeros((0, len(task.state_names)))
     with user_code.blamed(f"env={config.env} cannot be reset"):
         found = [np.asarray(_environment(config).reset(seed=seed)[0], float) for seed in range(resets)]
     return np.stack(found)
