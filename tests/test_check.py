@@ -111,6 +111,21 @@ def test_training_notes_what_checking_does(tmp_path: Path) -> None:
         assert part in "\n".join(notes)
 
 
+def test_a_mujoco_file_is_checked_without_a_robot(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco><worldbody><body><joint name="j" type="hinge" axis="0 1 0" damping=".05"/><geom type="capsule"'
+        ' size=".03" fromto="0 0 0 0 0 -.5"/></body></worldbody><actuator><motor joint="j" ctrlrange="-2 2"/></actuator></mujoco>'
+    )
+    words = ["task=mjcf", "mjcf=arm.xml", "cost=robot:big", "dt=0.04", "start_std=[0.1]"]
+    code, said, asked = call("check", *words, cwd=tmp_path)
+    assert (code, asked) == (0, []), said
+    for part in ("j [rad], j' [rad/s]", "more than 1: success"):
+        assert part in said
+    code, said, _ = call("check", *words, "start_mean=[180,0]", cwd=tmp_path)
+    assert (code, said.count("\n")) == (2, 1), said
+    assert "degrees?" in said
+
+
 def facts(start: float) -> Facts:
     wide = np.full(2, np.inf)
     return Facts(np.array([start, 0.0]), np.zeros(2), (0,), -wide, wide, np.zeros((0, 2)))

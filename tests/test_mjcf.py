@@ -200,7 +200,11 @@ def test_what_mjx_simulates_as_mujoco_does_is_let_through(pendulum: mjcf.Mechani
     [
         {"motor": MOTOR.replace("/>", ' delay="0.02" nsample="20"/>')},
         {"density": '1000" actuatorgroupdisable="0'},
-        {"geom": 'fluidshape="ellipsoid" density="100"', "density": '1000" viscosity="5'},
+        {
+            "geom": 'fluidshape="ellipsoid" density="100"',
+            "density": '1000" viscosity="5',
+            "motor": MOTOR.replace("-1 1", "-50 50"),
+        },
     ],
 )
 def test_another_physics_is_seen_by_comparing(parts: dict[str, str], tmp_path: Path) -> None:

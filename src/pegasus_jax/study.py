@@ -14,7 +14,7 @@ import numpy as np
 
 from pegasus_jax import mesh, settings
 from pegasus_jax.build import build, set_precision
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import SIZES, SettingError
 from pegasus_jax.config import Config
 from pegasus_jax.defaults import GYM
 from pegasus_jax.episode import succeeded
@@ -148,9 +148,15 @@ def seed_list(text: str) -> list[int]:
     """Seeds of '0-9' or '0,3,7'. Raises SettingError for anything else."""
     first, dash, last = text.partition("-")
     try:
-        seeds = list(range(int(first), int(last) + 1)) if dash else [int(part) for part in text.split(",")]
+        seeds = (
+            list(range(int(first), min(int(last), int(first) + SIZES["trials"]) + 1))
+            if dash
+            else [int(part) for part in text.split(",")]
+        )
     except ValueError:
         seeds = []
-    if not seeds or min(seeds) < 0:
-        raise SettingError(f"seeds={text} names no seeds; for example seeds=0-9 or seeds=0,3,7")
+    if not seeds or min(seeds) < 0 or len(seeds) > SIZES["trials"]:
+        raise SettingError(
+            f"seeds={text} names no seeds, or more than {SIZES['trials']:,}; for example seeds=0-9 or seeds=0,3,7"
+        )
     return seeds

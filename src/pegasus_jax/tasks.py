@@ -151,7 +151,10 @@ def _complete(config: Config) -> None:
     """Raises SettingError unless an environment is named, and a cost that there is: no robot is opened in vain."""
     if config.env is None or config.cost is None:
         raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
-    user_code.load("cost", config.cost)  # from now on modules in the working folder are found, the environment's too
+    user_code.load("cost", config.cost)
+    module, colon, _ = config.env.partition(":")
+    if colon:  # Gymnasium imports it, to register what is in it
+        user_code.importing(f"env={config.env}", module)
 
 
 def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarray]:

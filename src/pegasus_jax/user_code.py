@@ -50,6 +50,10 @@ def importing(what: str, module: str, not_from: Path | None = None) -> ModuleTyp
     if here not in sys.path and not (not_from and _within(Path(here), not_from)):
         sys.path.append(here)
     parts = module.split(".")
+    if parts[0] not in sys.modules and importlib.util.find_spec(parts[0]) is None:
+        raise SettingError(
+            f"{what} cannot be imported: no module named '{parts[0]}' in {here} or among the installed packages"
+        )
     for count in range(1, len(parts) + 1):  # from the outside in: to find a module imports those that hold it
         part = ".".join(parts[:count])
         place = origin(part, what)
