@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from pegasus_jax import tasks
     from pegasus_jax.build import build, compose
     from pegasus_jax.config import Config
-    from pegasus_jax.deployed import controller
+    from pegasus_jax.deploy import controller
     from pegasus_jax.fit import fit
     from pegasus_jax.rollout import rollout
     from pegasus_jax.scenarios import draw
@@ -56,7 +56,7 @@ class _Package(ModuleType):
     Config = _From("config", "Config")
     build = _From("build", "build")
     compose = _From("build", "compose")
-    controller = _From("deployed", "controller")
+    controller = _From("deploy", "controller")
     draw = _From("scenarios", "draw")
     fit = _From("fit", "fit")
     objective = _From("search", "objective")
