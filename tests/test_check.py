@@ -114,7 +114,8 @@ def test_training_notes_what_checking_does(tmp_path: Path) -> None:
 def test_a_mujoco_file_is_checked_without_a_robot(tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text(
         '<mujoco><worldbody><body><joint name="j" type="hinge" axis="0 1 0" damping=".05"/><geom type="capsule"'
-        ' size=".03" fromto="0 0 0 0 0 -.5"/></body></worldbody><actuator><motor joint="j" ctrlrange="-2 2"/></actuator></mujoco>'
+        ' size=".03" fromto="0 0 0 0 0 -.5"/></body></worldbody><actuator><motor joint="j" ctrlrange="-2 2"/>'
+        "</actuator></mujoco>"
     )
     words = ["task=mjcf", "mjcf=arm.xml", "cost=robot:big", "dt=0.04", "start_std=[0.1]"]
     code, said, asked = call("check", *words, cwd=tmp_path)
