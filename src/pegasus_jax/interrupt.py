@@ -87,8 +87,8 @@ def end(code: int) -> None:
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # nobody reads it any more
             stream.flush()
-    if code and any(thread.is_alive() for thread in others):
-        os._exit(code)  # the compiler's threads cannot be stopped
+    if code >= 128 or (code and any(thread.is_alive() for thread in others)):
+        os._exit(code)  # the compiler's threads cannot be stopped, and other libraries' would be surprised
     sys.exit(code)
 
 

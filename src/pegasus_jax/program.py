@@ -16,7 +16,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
-from pegasus_jax import mesh
+from pegasus_jax import interrupt, mesh
 from pegasus_jax.episode import trimmed
 from pegasus_jax.machine import processors
 from pegasus_jax.types import Episode, Experiment, Params, Trajectory
@@ -136,6 +136,7 @@ class Program:
 
     def __call__(self, part: str, *arguments: Any, purpose: str | None = None) -> Any:
         """Run a part; its time is counted as that of `purpose`."""
+        interrupt.check()  # one that came while a library swallowed it
         jitted, name = self.parts[part], purpose or part
         if self.mesh is not None:
             arguments = self.laid_out(part, arguments, placed)

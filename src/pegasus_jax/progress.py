@@ -52,7 +52,7 @@ class Display:
     def __init__(self, trials: int, console: Console | None = None, quiet: bool = False) -> None:
         self.console = console or Console(file=sys.stderr, highlight=False, quiet=quiet)
         self.trials = trials
-        self.what, self.since = "preparing", time.monotonic()
+        self.what, self.stage, self.since = "preparing", "preparing", time.monotonic()
         self.said, self.spoke = "", self.since  # the last line of a log, and when
         self.clock = Clock()
         self.live: Progress | None = None
@@ -84,6 +84,7 @@ class Display:
             f"trial {trial}/{self.trials}  {PHASES.get(what, what)}{note}",
             fraction,
             "" if left is None else f"about {duration(left)} left",
+            stage=f"{trial} {what}",
         )
 
     @contextmanager
@@ -102,8 +103,11 @@ class Display:
         self.spoke = time.monotonic()
         self.console.print(text, markup=False, soft_wrap=True)
 
-    def _show(self, what: str, fraction: float | None = None, left: str | None = None) -> None:
-        self.what, self.since = what, time.monotonic()
+    def _show(self, what: str, fraction: float | None = None, left: str | None = None, stage: str = "") -> None:
+        stage = stage or what
+        if stage != self.stage:
+            self.stage, self.since = stage, time.monotonic()
+        self.what = what
         if self.live is not None:
             fields: dict[str, Any] = {} if left is None else {"left": left}
             self.live.update(self.task, description=what, completed=fraction, **fields)
@@ -112,9 +116,9 @@ class Display:
         """The lines of a log, printed by a thread because the phases themselves are at work."""
         while not over.wait(BRIEF / 4):
             now = time.monotonic()
-            fresh = self.what != self.said and now - self.since > BRIEF and now - self.spoke > BRIEF
+            fresh = self.stage != self.said and now - self.since > BRIEF and now - self.spoke > BRIEF
             if fresh or now - self.spoke > SILENCE:
-                self.said = self.what
+                self.said = self.stage
                 left = self.clock.left(self.trials)
                 self.line(self.what if left is None else f"{self.what}  about {duration(left)} left")
 
@@ -217,6 +221,8 @@ def learned(rows: Sequence[dict[str, Any]]) -> str:
 
 def best_line(rows: Sequence[dict[str, Any]], trial: int) -> str:
     """The trial with the best policy of a run, and what its evaluation, or else its own episodes, say of it."""
+    if all(row["objective_fresh"] is None for row in rows):
+        return "no policy was learned: every episode was of random controls"
     row = rows[trial - 1]
     own = [other["episode_cost"] for other in rows if other.get("policy") == trial]
     if row["mean_cost"] is not None:

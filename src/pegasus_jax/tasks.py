@@ -210,7 +210,8 @@ def environment(config: Config) -> Any:
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         raise SettingError(f"env={config.env}: {str(error).splitlines()[0]}") from error
     except Exception as error:
-        raise SettingError(f"env={config.env} cannot be made: {user_code.told(error)}") from error
+        given = "; env_args.NAME=VALUE gives arguments" if isinstance(error, TypeError) else ""
+        raise SettingError(f"env={config.env} cannot be made: {user_code.told(error)}{given}") from error
     finally:
         interrupt.reclaim()
 
