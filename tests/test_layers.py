@@ -21,8 +21,8 @@ LAYERS = {
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",
-    6: "board cache check checkpoint deploy facts files machine record report. restore cli program progress settings"
-    " sweep train study __main__ __init__",
+    6: "board cache check checkpoint deploy facts files machine record report. restore cli cli_help cli_runs cli_train"
+    " program progress settings sweep train study __main__ __init__",
 }
 TOP = max(LAYERS)  # the layer that is an application: here modules may import each other, without cycles
 

@@ -178,3 +178,11 @@ def kind(section: str, value: str, kind: str) -> None:
         raise SettingError(
             f"{section}.kind={value} cannot be set: model=, policy= and algorithm= choose what {section} is"
         )
+
+
+def whole(name: str, text: str) -> int:
+    """The whole number of an option. Raises SettingError when it is none, or 0 where nothing would be done."""
+    if not text.isdecimal() or (name in ("episodes", "seeds", "jobs") and int(text) < 1):
+        raise SettingError(f"{name}={text} is not a whole number; for example {name}=20")
+    within(name, int(text), 0, 2**32 - 1 if name == "seed" else SIZES["trials"])
+    return int(text)

@@ -13,8 +13,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax.checks import SettingError, nearest
-from pegasus_jax.cli import main, whole
+from pegasus_jax.checks import SettingError, nearest, whole
+from pegasus_jax.cli import main
 
 SWEEP = """\
 pegasus-sweep task=NAME [setting=value,value,... ...]     learn with every combination of the values
