@@ -255,7 +255,7 @@ WRONG = [
     (["policy.hidden=null"], ["is not a list of whole numbers"]),
     (["model.dropout=[1]"], ["model.dropout=[1] is not a word"]),
     (["model.dropout=null"], ["model.dropout=null is not a word"]),
-    (["seed=${trials}"], ["seed=", "is not a whole number"]),
+    (["seed=${trials}"], ["seed=", "is not a value but a reference"]),
     # impossible values
     (["legs=4"], ["legs=4 is not a choice", "choices: 2, 6"]),
     (["task=swimmer_belly_up", "legs=many"], ["legs=many is not a whole number", "for example legs=2"]),
