@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 CODE  := $(wildcard src envs tests benchmarks)
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test check format bench bench-compare figures docs lock clean
+.PHONY: help setup train test test-slow check format bench bench-compare figures docs lock clean
 .DELETE_ON_ERROR:
 
 help: ## list the targets
@@ -24,7 +24,10 @@ train: $(STAMP) ## learn the cart-pole swing-up; settings: make train ARGS="tria
 	$(BIN)/pegasus-train $(if $(filter task=% resume=% --help -h,$(ARGS)),,task=cartpole) $(ARGS)
 
 test: $(STAMP) ## run the tests on JOBS=2 cores; some of them: make test ARGS="-k layers"
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations 10 $(ARGS)
+	$(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations 10 $(ARGS)
+
+test-slow: $(STAMP) ## run the long campaigns of kills, damages, bad commands and stops: an hour or more
+	$(BIN)/python -m pytest -m slow $(ARGS)
 
 check: $(STAMP) ## formatting, lint, types, layers: everything that needs no training
 	$(BIN)/ruff format --check $(CODE)

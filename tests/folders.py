@@ -28,7 +28,7 @@ def row(trial: int, **known: Any) -> dict[str, Any]:
     numbers = dict(
         mean_cost=None, success_rate=None, objective_last=0.5, objective_fresh=0.5, plant_seconds=trial * 2.5
     )
-    policy = {"random": trial == 1, "policy": trial - 1}
+    policy = {"random": trial == 1, "policy": trial - 1, "episode_success": False, "ended": "horizon"}
     return {"trial": trial, "episode_cost": 1 - trial / 10, **numbers, **policy, **known}
 
 

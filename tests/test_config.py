@@ -3,11 +3,12 @@
 import dataclasses
 import math
 
+import numpy as np
 import pytest
 
-from pegasus_jax import config
 from pegasus_jax.checks import SettingError, nearest
 from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
+from pegasus_jax.config_models import DROPOUTS
 
 
 def test_a_config_is_a_key():
@@ -82,6 +83,25 @@ IMPOSSIBLE = [
     (Config, dict(seed=2**32), "the nearest is 4294967295"),
     (Config, dict(trials=0), "trials=0"),
     (Config, dict(trials=10**6), "the nearest is 10000"),
+    (Config, dict(trials=1.5), "trials=1.5 is not a whole number; for example trials=15"),
+    (Config, dict(seed=1.5), "seed=1.5 is not a whole number"),
+    (Config, dict(trials=True), "trials=true is not a whole number"),
+    (Config, dict(trials="many"), "trials=many is not a whole number"),
+    (Config, dict(model="bnn"), "model=bnn is not"),
+    (Config, dict(angles=[[1]]), "angles=[[1]] is not a list of whole numbers"),
+    (Config, dict(angles=3), "angles=3 is not a list of whole numbers"),
+    (Config, dict(angles=(0, 0)), "names 0 twice"),
+    (Config, dict(start_mean=(math.nan, 0.0)), "start_mean=nan is not a finite number"),
+    (Config, dict(dt="fast"), "dt=fast is not a number or null"),
+    (Config, dict(dt=1e9), "the nearest is"),
+    (Config, dict(success=0.0), "success=0"),
+    (Search, dict(steps=1.5), "search.steps=1.5 is not a whole number"),
+    (Search, dict(match="no"), "search.match=no is not true or false; for example search.match=true"),
+    (Search, dict(clip="none"), "search.clip=none is not a number or null"),
+    (Search, dict(steps=10**20), "the nearest is 10000000"),
+    (Period, dict(match=None), "search.period.match=null is not a whole number"),
+    (MLP, dict(squash=None), "policy.squash=null is not a word"),
+    (Fit, dict(steps="10"), "fit.steps=10 is not a whole number"),
 ]
 
 
@@ -95,6 +115,13 @@ def test_an_impossible_value_is_named_in_one_line(kind, fields, part):
     assert next(iter(fields)) in message
 
 
+def test_numbers_of_numpy_become_pythons_own():
+    """A config is a key and is stored as text: a number of another kind would be neither."""
+    chosen = Config(seed=np.int64(3), trials=np.int32(2), start_mean=np.float32([1, 2]).tolist(), dt=np.float64(0.5))
+    assert chosen == Config(seed=3, trials=2, start_mean=(1.0, 2.0), dt=0.5)
+    assert [type(value) for value in (chosen.seed, chosen.trials, chosen.dt)] == [int, int, float]
+
+
 def test_limits_themselves_are_possible():
     BNN(rate=0.0, weight_decay=0.0)
     BNN(rate=0.99, hidden=(1,))
@@ -106,5 +133,5 @@ def test_limits_themselves_are_possible():
 
 
 def test_the_nearest_choice():
-    assert nearest("lognormal", config.DROPOUTS) == f"did you mean 'log_normal'? choices: {', '.join(config.DROPOUTS)}"
+    assert nearest("lognormal", DROPOUTS) == f"did you mean 'log_normal'? choices: {', '.join(DROPOUTS)}"
     assert nearest("xyz", ("tanh", "sine")) == "choices: tanh, sine"

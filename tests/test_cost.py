@@ -205,3 +205,29 @@ def test_the_matched_cost_is_that_of_the_particles_gaussian(x64):
     assert matched.shape == (3, 1)
     for t in range(3):
         np.testing.assert_allclose(matched[t, 0], expected(x[t].mean(0), np.cov(x[t].T)), rtol=1e-10)
+
+
+def test_particles_that_stop_cost_what_the_user_says_from_then_on():
+    """A hard stop by hand: the state that ends a particle has its own cost, those after it `stop_cost`."""
+    x = jnp.asarray([[[0.0], [0.0]], [[2.0], [0.0]], [[0.0], [0.0]], [[0.0], [3.0]]])  # [H, K, D]
+    costs = jnp.asarray(COSTS[:4, :2])
+    found = cost.until_stop(costs, x, lambda x: x[0] > 1, 0.9)
+    expected = COSTS[:4, :2].copy()
+    expected[2:, 0] = 0.9
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    # Of an expectation over particles, the half that goes on counts.
+    one = cost.until_stop(costs[:, :1], x, lambda x: x[0] > 1, 0.9)
+    np.testing.assert_allclose(one[:, 0], [*COSTS[:2, 0], *(0.5 * COSTS[2:4, 0] + 0.45)], rtol=1e-6)
+
+
+def test_a_soft_stop_has_a_gradient_and_is_its_own_expectation():
+    """Stopping with probability p at every state: after t of them (1 - p)^t of a particle goes on."""
+    x = jnp.zeros((5, 3, 2))
+    found = cost.until_stop(jnp.full((5, 3), 0.2), x, lambda x: 0.25 + 0 * x[0], 1.0)
+    np.testing.assert_allclose(found[:, 1], 1 - 0.8 * 0.75 ** np.arange(5), rtol=1e-6)
+    total = lambda shift: jnp.mean(  # noqa: E731
+        cost.until_stop(jnp.full((5, 3), 0.2), x + shift, lambda x: jax.nn.sigmoid(x[0]), 1.0)
+    )
+    slope = (total(1e-2) - total(-1e-2)) / 2e-2
+    assert slope > 0.1
+    np.testing.assert_allclose(jax.grad(total)(0.0), slope, rtol=1e-2)

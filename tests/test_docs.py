@@ -1,7 +1,20 @@
-"""The code in the documentation runs as it stands."""
+"""What is documented runs as it stands: every fenced program, file and command of README.md and docs/, page by page.
 
+A page has a folder of its own, into which the files that the pages name are written, and in which its commands are run
+by a shell, in order. Settings are cut down by PEGASUS_SETTINGS, which is documented, and by nothing else.
+"""
+
+from __future__ import annotations
+
+import os
 import re
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import pytest
@@ -9,17 +22,138 @@ import pytest
 from pegasus_jax.settings import parse, split
 
 ROOT = Path(__file__).resolve().parents[1]
-BLOCKS = [
-    pytest.param(block, id=f"{page.name}-{i}")
-    for page in [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
-    for i, block in enumerate(re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL))
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+class Block(NamedTuple):
+    """A fenced block of a page."""
+
+    kind: str  # python, xml, math, or "" for commands
+    text: str
+    file: str  # what the paragraph above calls it, "" for no file
+
+
+def blocks(page: Path) -> list[Block]:
+    """The fenced blocks of a page that are not mathematics. A file is named by the paragraph above it, if at all."""
+    found, text = [], page.read_text()
+    for match in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
+        above = text[: match.start()].rstrip().rpartition("\n\n")[2]
+        names = re.findall(r"`(\w+\.(?:py|xml|toml))`", above) if match[1] in ("python", "xml", "toml") else []
+        found.append(Block(match[1], match[2], names[-1] if names else ""))
+    return [block for block in found if block.kind != "math"]
+
+
+def commands(block: Block) -> list[str]:
+    """The lines of a block of commands, those that go on put together, without what only explains them."""
+    lines = block.text.replace("\\\n", " ").splitlines()
+    return [line.partition("  #")[0].strip() for line in lines if line.strip()]
+
+
+FILES = [block for page in PAGES for block in blocks(page) if block.file]
+USED = re.compile(r"\bruns/")  # a program that reads a run is one of a page's commands
+PROGRAMS = [
+    pytest.param(block.text, id=f"{page.stem}-{number}")
+    for page in PAGES
+    for number, block in enumerate(blocks(page))
+    if block.kind == "python" and not block.file
+]
+RUN = [
+    pytest.param(page, id=page.stem)
+    for page in PAGES
+    if any(block.kind in ("", "bash", "sh") for block in blocks(page))
 ]
 
+# What the commands find in a page's folder, as in a checkout.
+CHECKOUT = ("Makefile", "pyproject.toml", "requirements.lock", "benchmarks", "src", "envs")
+# What is not run here, each with the reason; its words are checked all the same.
+NOT_RUN = {
+    "make test": "it would run this test again",
+}
+TINY = "fit.steps=3 search.steps=4"
+SMALL = {  # a part of a command -> a setting that makes it small, unless the command is about that
+    "model=": "model.hidden=[8]",
+    "policy=": "policy.hidden=[8]",
+    "algorithm=pilco": "search.particles=8",
+    "evaluation=": "evaluation=1",
+}
 
-@pytest.mark.parametrize("block", BLOCKS)
-def test_example_runs(block: str) -> None:
+
+def cut(command: str) -> str:
+    """Settings that make a command quick. Learning takes place for `make train` and for the robot only."""
+    words = command.split()
+    if words[0] not in ("make", "pegasus-train"):
+        return ""
+    if any(word.startswith("resume=") for word in words):  # of a run that was cut down already
+        return f"{TINY} trials=2"
+    learns = words[0] == "make" or "env=robot:Arm-v0" in words
+    small = [setting for about, setting in SMALL.items() if about not in command]
+    return " ".join([TINY, *small, "explore.trials=2", "trials=2" if learns else "trials=1"])
+
+
+@pytest.fixture(scope="module")
+def tools(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """The environment of a shell in which this interpreter and the commands of pyproject.toml are found."""
+    folder = tmp_path_factory.mktemp("tools")
+    (folder / "bin").mkdir()
+    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    for name, where in scripts.items():
+        module, function = where.split(":")
+        program = f"#!{sys.executable}\nimport sys\nfrom {module} import {function}\nsys.exit({function}())\n"
+        (folder / "bin" / name).write_text(program)
+    python = folder / "bin" / "python"  # not a link: it would not know its environment
+    python.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n')
+    (folder / ".installed").touch()
+    for program in (folder / "bin").iterdir():
+        program.chmod(0o755)
+    return {
+        **os.environ,
+        "PATH": f"{folder / 'bin'}:{os.environ['PATH']}",
+        "PYTHONPATH": f"{ROOT / 'src'}:{ROOT / 'envs'}",
+        "XDG_CACHE_HOME": str(folder / "cache"),
+        "VENV": str(folder),  # for make, to which this is an environment where everything is installed
+    }
+
+
+def shell(command: str, folder: Path, environment: dict[str, str]) -> None:
+    done = subprocess.run(
+        ["sh", "-c", command], cwd=folder, env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+
+
+@pytest.mark.parametrize("page", RUN)
+def test_a_page_runs_from_the_top_to_the_end(page: Path, tmp_path: Path, tools: dict[str, str]) -> None:
+    for name in CHECKOUT:
+        (shutil.copytree if (ROOT / name).is_dir() else shutil.copy2)(ROOT / name, tmp_path / name)
+    own = {block.file for block in blocks(page)}
+    for block in FILES:  # what this page takes from another one
+        if block.file not in own:
+            append(tmp_path / block.file, block.text)
+    for block in blocks(page):
+        if block.file:
+            append(tmp_path / block.file, block.text)
+        if block.file and USED.search(block.text):
+            shell(f"python {block.file}", tmp_path, tools)
+        for command in commands(block) if block.kind in ("", "bash", "sh") else ():
+            if command not in NOT_RUN:
+                shell(command, tmp_path, {**tools, "PEGASUS_SETTINGS": cut(command)})
+
+
+def append(path: Path, text: str) -> None:
+    """Write a file, or go on with it, as somebody who reads the page from the top would."""
+    path.write_text(path.read_text() + "\n" + text if path.exists() else text)
+
+
+@pytest.mark.parametrize("command", NOT_RUN)
+def test_what_is_not_run_is_documented_and_there(command: str, tools: dict[str, str]) -> None:
+    assert any(command in commands(block) for page in PAGES for block in blocks(page))
+    shell(f"{command} --dry-run", ROOT, tools)
+
+
+@pytest.mark.parametrize("program", PROGRAMS)
+def test_example_runs(program: str) -> None:
     with jax.debug_key_reuse(False):  # vmap of a scan over split keys is its one false alarm (conftest.py)
-        exec(compile(block, "example", "exec"), {"__name__": "example"})
+        exec(compile(program, "example", "exec"), {"__name__": "example"})
 
 
 METHOD = (ROOT / "docs" / "method.md").read_text()
@@ -54,5 +188,13 @@ def test_method_commands_are_settings(command: str) -> None:
     parse(settings)
 
 
-def test_there_are_examples() -> None:
-    assert len(BLOCKS) >= 4
+def test_every_block_is_a_program_a_file_or_commands() -> None:
+    for page in PAGES:
+        for block in blocks(page):
+            assert block.kind in ("", "bash", "sh", "python", "xml", "toml"), f"{page.name}: {block.kind}"
+            if block.kind in ("xml", "toml"):
+                assert block.file, f"{page.name} does not say what the file is called: {block.text[:40]}"
+            for command in commands(block) if block.kind in ("", "bash", "sh") else ():
+                assert shlex.split(command)[0].startswith(("pegasus-", "make", "python")), command
+    assert {block.file for block in FILES} == {"mymodule.py", "arm.xml", "robot.py", "drive.py"}
+    assert len(PROGRAMS) >= 4

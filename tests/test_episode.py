@@ -48,7 +48,7 @@ def test_the_controller_has_a_key_of_its_own_at_every_step():
 
 
 def test_a_task_without_a_plant_says_so():
-    with pytest.raises(AssertionError, match="cart has no simulated plant"):
+    with pytest.raises(ValueError, match="cart has no plant in JAX"):
         episode.run(jax.random.key(0), lambda key, t, x: x[:1], TASK._replace(plant=None))
 
 
@@ -69,3 +69,20 @@ def test_a_random_walk_stays_or_goes_most_of_the_way():
     assert np.all((jumps >= LOW - 1e-4) & (jumps <= HIGH + 1e-4))
     still = np.asarray(episode.uniform(jax.random.key(0), LOW, HIGH, 1000))
     assert not np.any(np.all(np.diff(still, axis=0) == 0, 1))
+
+
+def test_a_plant_in_jax_ends_where_the_task_says_so():
+    task = TASK._replace(stop=lambda x: x[0] > 1.5, stop_cost=0.8)
+    push = lambda key, t, x: jnp.array([2.0])  # noqa: E731
+    free = jax.jit(lambda key: episode.run(key, push, TASK._replace(sensor_std=np.zeros(2))))(jax.random.key(0))
+    flight = jax.jit(lambda key: episode.run(key, push, task._replace(sensor_std=np.zeros(2))))(jax.random.key(0))
+    length = 1 + int(np.argmax(free.x[1:, 0] > 1.5))
+    assert 1 < length < 6
+    assert int(flight.length) == length
+    np.testing.assert_allclose(flight.cost, [*free.cost[:length], *[0.8] * (6 - length)], rtol=1e-6)
+    short = episode.trimmed(flight)
+    assert (short.x.shape, short.u.shape, short.length) == ((length + 1, 2), (length, 1), None)
+    whole = episode.padded(short, 6)
+    assert (whole.x.shape, int(whole.length)) == ((7, 2), length)
+    np.testing.assert_array_equal(episode.trimmed(whole).x, short.x)
+    np.testing.assert_allclose(episode.charged(short.cost, task), flight.cost, rtol=1e-6)

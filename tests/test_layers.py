@@ -14,21 +14,24 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # A name ending in a dot is a package: the layer of everything in it.
 LAYERS = {
-    0: "types checks config variants",
+    0: "types checks config config_models variants defaults interrupt",
     1: "angles mesh quantile dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout"
-    " episode calibration",
-    2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco",
+    " episode calibration user_code",
+    2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco cost_check",
     3: "dynamics. policy. trial",
     4: "tasks",
     5: "build",
-    6: "board cache checkpoint deployed facts files machine record report. restore cli program progress settings sweep"
-    " train study __main__ __init__",
+    6: "board cache check checkpoint deploy facts files machine record report. restore cli program progress settings"
+    " sweep train study __main__ __init__",
 }
 TOP = max(LAYERS)  # the layer that is an application: here modules may import each other, without cycles
 
 # (importer, imported), both of one layer below TOP.
 SIBLINGS: set[tuple[str, str]] = {
+    ("config_models", "checks"),
+    ("config", "config_models"),  # the settings of the models are its
     ("config", "checks"),  # a setting is checked when it is made
+    ("defaults", "config"),  # what a task changes in them; a folder's name is made of them
     ("variants", "config"),  # a variant is made of settings
     ("dropout", "quantile"),  # uniform draws, and what makes a truncated normal of them
     ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
@@ -44,6 +47,7 @@ SIBLINGS: set[tuple[str, str]] = {
     ("pilco", "search"),  # and one report of how a search went
     ("lbfgs", "fit"),  # what every fit reports
     ("policy.external", "policy.squash"),  # every controller saturates the same ways
+    *((f"policy.{kind}", "policy.scaled") for kind in ("mlp", "linear", "rbf")),  # large inputs, the same way
     ("noisy", "network"),  # the one network, with noise on its units
     ("mechanics", "network"),  # a mechanism's energies are that network
     ("mechanics_kernel", "mechanics"),  # the same equations, where they are compiled by hand

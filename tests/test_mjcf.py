@@ -13,11 +13,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from pegasus_envs import mjcf
+from pegasus_envs import mjcf, mjcf_check
 from pegasus_envs.render import frames
 from pegasus_jax import record, settings, tasks
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
+from pegasus_jax.defaults import label
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
 PENDULUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "inverted_pendulum.xml"
@@ -96,10 +97,10 @@ def test_learns_and_resumes_from_the_command_line(tmp_path: Path) -> None:
     run = tmp_path / "runs" / "mjcf-cart-seed0"
     assert [row["random"] for row in record.trials(run)] == [True, False]
     assert settings.load(run / "config.yaml").mjcf == str(tmp_path / "cart.xml")
-    episode = record.load_episode(run, 2)
-    assert episode is not None
-    assert (episode.x.shape, episode.u.shape) == ((9, 4), (8, 1))
-    assert np.all(np.abs(episode.u) <= 3)
+    ran = record.load_episode(run, 2)
+    assert ran is not None
+    assert (ran.trajectory.x.shape, ran.trajectory.u.shape) == ((9, 4), (8, 1))
+    assert np.all(np.abs(ran.trajectory.u) <= 3)
     (tmp_path / "cart.xml").write_text(PENDULUM.read_text().replace("9.81", "1.6"))
     again = command(f"resume={run}", "trials=3", cwd=tmp_path)
     assert again.returncode == 2, again.stderr
@@ -120,7 +121,7 @@ def test_a_file_is_known_by_its_content(tmp_path: Path) -> None:
 
 def test_folders_tell_tasks_apart() -> None:
     labels = [
-        tasks.label(made)
+        label(made)
         for made in (
             config("some/arm.xml"),
             Config(task="gym", env="package:ns/Pendulum-v1"),
@@ -142,6 +143,8 @@ def test_folders_tell_tasks_apart() -> None:
         ({"observe": ("tip",)}, "choose from qpos.0"),
         ({"control_low": (1.0, 2.0)}, "control_low has 2 entries; expected 1"),
         ({"control_low": (5.0,)}, "control_low=5 must be less than control_high=3"),
+        ({"dt": 2000.0}, "dt=2000 is 100000 of its time steps; the most is dt=200"),
+        ({"start_mean": (0.1,)}, "start_mean has 1 entries; expected 4"),
         ({"start_mean": (1.0, 2.0)}, "start_mean has 2 entries; expected 4"),
         ({"angles": (4,)}, "choose from 0 to 3"),
         ({"cost": "math:nothing"}, "cost=math:nothing cannot be imported"),
@@ -162,6 +165,9 @@ def test_bad_settings_are_one_line(changes: dict[str, object], message: str) -> 
         ({"geom": 'fluidshape="ellipsoid"'}, "MJX ignores fluidshape"),
         ({"motor": MOTOR + "<nonsense/>"}, "MuJoCo cannot read it"),
         ({"density": '1000" integrator="implicit'}, "MJX cannot simulate it"),
+        ({"density": '1000" noslip_iterations="3'}, "MJX ignores noslip_iterations"),
+        ({"density": '1000" actuatorgroupdisable="0'}, "MJX ignores actuatorgroupdisable"),
+        ({"motor": MOTOR.replace("/>", ' delay="0.05" nsample="20"/>')}, "MJX ignores delay of an actuator"),
     ],
 )
 def test_files_that_cannot_be_are_one_line(parts: dict[str, str], message: str, tmp_path: Path) -> None:
@@ -171,3 +177,51 @@ def test_files_that_cannot_be_are_one_line(parts: dict[str, str], message: str, 
         tasks.of_config(config(path, dt=0.02))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def arm(path: Path, **parts: str) -> mjcf.Mechanism:
+    """The arm of a file with these parts, whatever MJX ignores of it."""
+    path.write_text(ARM.format(**{"density": "1000", "geom": "", "motor": MOTOR} | parts))
+    return mjcf.mechanism(mujoco.MjModel.from_xml_path(str(path)), 0.02, start_std=[0.1])
+
+
+def test_flags_that_change_nothing_are_cleared(tmp_path: Path) -> None:
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        ARM.format(
+            density='1000"><flag energy="enable" fwdinv="enable"/></option><option density="1000', geom="", motor=MOTOR
+        )
+    )
+    assert mjcf.read(path).opt.enableflags == 0
+
+
+def test_what_mjx_simulates_as_mujoco_does_is_let_through(pendulum: mjcf.Mechanism, tmp_path: Path) -> None:
+    mjcf_check.compare(pendulum)
+    mjcf_check.compare(arm(tmp_path / "arm.xml"))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"motor": MOTOR.replace("/>", ' delay="0.02" nsample="20"/>')},
+        {"density": '1000" actuatorgroupdisable="0'},
+        {
+            "geom": 'fluidshape="ellipsoid" density="100"',
+            "density": '1000" viscosity="5',
+            "motor": MOTOR.replace("-1 1", "-50 50"),
+        },
+    ],
+)
+def test_another_physics_is_seen_by_comparing(parts: dict[str, str], tmp_path: Path) -> None:
+    """Also without knowing what it is that MJX ignores."""
+    made = arm(tmp_path / "arm.xml", **parts)
+    assert mjcf.ignored(made.model)
+    with pytest.raises(ValueError, match=r"does not simulate it as MuJoCo does: elbow.* differs in \d+ of 20"):
+        mjcf_check.compare(made)
+
+
+def test_a_simulation_that_breaks_down_is_not_learned_from(tmp_path: Path) -> None:
+    motor = '<position joint="elbow" kp="1e7" ctrllimited="true" ctrlrange="-1 1"/>'
+    with pytest.raises(ValueError, match=r"not stable: it breaks down in period \d+ of"):
+        mjcf_check.compare(arm(tmp_path / "arm.xml", motor=motor, density='0" timestep="0.02'))
+    assert not Path("MUJOCO_LOG.TXT").exists()

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
+import os
+from functools import partial
 from pathlib import Path
 
 import imageio.v2 as imageio
+import jax
 import numpy as np
 import pytest
 
-from pegasus_jax.report.play import HEIGHT, STRIP, WIDTH, composed, strip
+from pegasus_envs import mjcf
+from pegasus_jax import settings
+from pegasus_jax.build import build
+from pegasus_jax.report.play import HEIGHT, STRIP, WIDTH, composed, performance, pictures, strip
 from pegasus_jax.tasks import make
 from pegasus_jax.types import Trajectory
 from test_train import call
 
 TINY = ["task=cartpole", "model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "trials=1"]
 TINY += ["search.particles=8"]
+ARM = """<mujoco><worldbody><body><joint name="elbow" type="hinge" axis="0 1 0"/>
+<geom type="capsule" size=".03" fromto="0 0 0 0 0 -.5"/></body></worldbody>
+<actuator><{motor} joint="elbow" ctrlrange="-2 2"/></actuator></mujoco>"""
+MOTORS = {"arm": "motor", "arm_with_state": 'general dyntype="filter" dynprm=".1"'}
 OPTIMISED = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}  # twenty episodes take longer than compiling them
 
 
@@ -39,6 +49,43 @@ def test_a_film_of_a_tiny_run(run: Path) -> None:
     first, last = pictures[0], pictures[-1]
     assert np.abs(first[:HEIGHT] - last[:HEIGHT]).max() > 50  # the pole has moved
     assert np.abs(first[HEIGHT:] - last[HEIGHT:]).max() > 50  # and the curves have appeared
+
+
+@pytest.mark.parametrize("name", ["cartpole", "double_cartpole", "swimmer_corkscrew", *MOTORS])
+def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
+    """Also one whose state has a part without entries, as an arm's whose motor has no state of its own."""
+    words = {"task": name, "policy.hidden": "[8]"}
+    if name in MOTORS:
+        (tmp_path / "arm.xml").write_text(ARM.format(motor=MOTORS[name]))
+        assert mjcf.read(tmp_path / "arm.xml").na == (name == "arm_with_state")
+        plant = {"mjcf": str(tmp_path / "arm.xml"), "cost": "jax.numpy:sum", "dt": ".04", "horizon": "2"}
+        words |= {"task": "mjcf", **plant}
+    experiment = build(settings.parse(words))
+    params = experiment.init(jax.random.key(0)).policy.params
+    task = experiment.task._replace(horizon=2, cost=lambda x: x[0])
+    perform = jax.jit(partial(performance, task=task, policy=experiment.policy, mean=True))
+    _, states = perform(jax.random.key(1), params)
+    drawn = np.array(pictures(task, states, 64, 48), int)
+    assert drawn.shape[1:] == (48, 64, 3)
+    assert len(drawn) % 2 == 0
+    assert drawn.std() > 0  # something is to be seen
+
+
+def test_a_film_replaces_a_link_and_what_it_leads_to_stays(run: Path, tmp_path: Path) -> None:
+    """Neither where the film goes nor where it is written is a file that was there opened."""
+    kept = tmp_path / "kept"
+    kept.write_text("mine")
+    for name in ("play.mp4", ".play.mp4"):
+        (run / name).unlink(missing_ok=True)
+        (run / name).symlink_to(kept)
+    done = call("play", run, cwd=run.parent, **OPTIMISED)
+    assert done.returncode == 0, done.stderr
+    assert kept.read_text() == "mine"
+    assert not (run / "play.mp4").is_symlink()
+    mask = os.umask(0)
+    os.umask(mask)
+    assert (run / "play.mp4").stat().st_mode & 0o777 == 0o666 & ~mask
+    (run / ".play.mp4").unlink()
 
 
 def test_curves_appear_as_time_goes_on() -> None:

@@ -1,16 +1,23 @@
 """Controllers: within the limits whatever they see, one mask along a rollout, and a mean policy without any."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pegasus_jax import dropout
+from pegasus_jax.angles import encode
+from pegasus_jax.policy.linear import linear
+from pegasus_jax.policy.rbf import rbf
+from pegasus_jax.policy.scaled import inherited, scaled
 from pegasus_jax.policy.squash import SQUASHES, sine, to_limits
-from probes import LIMITS, controller
+from probes import LIMITS, controller, experience, same
 
 every_squash = pytest.mark.parametrize("squash", SQUASHES)
 single = st.floats(-1e6, 1e6, width=32)
@@ -112,3 +119,95 @@ def test_scales_of_input_and_output():
     both = plain.init(jax.random.key(0))
     one, two = plain.apply(both, None, jnp.array([0.6, 0.2, 1.0])), scaled.apply(both, None, jnp.array([0.3, 0.2, 1.0]))
     np.testing.assert_allclose(one, two, rtol=1e-5)
+
+
+def with_entry(entry, rows=30):
+    """Data of the rig with its first entry replaced, each row by a number of `entry`."""
+    data = experience(rows)
+    return data._replace(x=data.x.at[:rows, 0].set(jnp.asarray(entry, jnp.float32)))
+
+
+KINDS = {
+    "mlp": lambda: controller(dropout.none()),
+    "linear": lambda: linear(
+        encode=partial(encode, angles=(2,)), features=4, controls=2, saturate=jnp.tanh, saturate_moments=None
+    ),
+    "rbf": lambda: rbf(
+        encode=partial(encode, angles=(2,)),
+        start=lambda key: jnp.array([1e4, 0.0, 0.0]) + jax.random.normal(key, (3,)),
+        waves=2,
+        controls=2,
+        units=10,
+        saturate=jnp.tanh,
+        saturate_moments=None,
+    ),
+}
+every_kind = pytest.mark.parametrize("kind", KINDS)
+
+
+@every_kind
+@given(seed=st.integers(0, 2**16), size=st.floats(1e-3, 9.0))
+def test_inputs_of_ordinary_size_are_left_as_they_are(kind, seed, size):
+    """To the last bit: parameters, control and gradient."""
+    policy = KINDS[kind]()
+    data = with_entry(size * np.random.default_rng(seed).uniform(-1, 1, 30))
+    fresh = policy.init(jax.random.key(seed))
+    assert same(policy.adapt(fresh, data), fresh)
+
+
+def test_a_network_that_leaves_its_inputs_alone_is_the_network_alone():
+    policy = controller(dropout.none())
+    params, x = policy.init(jax.random.key(0)), jnp.array([0.3, -0.7, 2.0])
+    hidden = jnp.maximum(layer(params, 0, encode(x, (2,))), 0)
+    low, high = LIMITS
+    expected = to_limits(SQUASHES["tanh"], jnp.float32(low), jnp.float32(high))(layer(params, 1, hidden))
+    assert np.array_equal(policy.apply(params, None, x), expected)
+
+
+def layer(params, i, inputs):
+    of = params["network"]["params"][f"layer_{i}"]
+    return inputs @ of["kernel"] + of["bias"]
+
+
+LARGE = {
+    "constant": np.full(30, 1e4),
+    "varies": 1e4 + 300 * np.random.default_rng(0).normal(size=30),
+    "a rate in degrees": 500 * np.random.default_rng(1).normal(size=30),
+    "far away": -3e6 + 1e5 * np.random.default_rng(2).normal(size=30),
+}
+
+
+@every_kind
+@pytest.mark.parametrize("name", LARGE)
+def test_a_large_entry_does_not_saturate_a_policy(kind, name):
+    """A fresh policy's gradient by its parameters is of the size that it has without the entry."""
+    policy, data = KINDS[kind](), with_entry(LARGE[name])
+    x = data.x[:30]
+
+    def sizes(params):
+        controls = lambda params: jnp.sum(jax.vmap(lambda x: policy.apply(params, None, x))(x) ** 2)  # noqa: E731
+        slopes = jax.vmap(lambda key: optax.tree.norm(jax.grad(controls)(params(key))))
+        return np.asarray(slopes(jax.random.split(jax.random.key(0), 10)))
+
+    given = sizes(lambda key: policy.adapt(policy.init(key), data))
+    assert np.isfinite(given).all()
+    if kind == "rbf" and name != "constant":  # its centres are drawn where episodes start: here at 1e4, give or take 1
+        return
+    assert np.median(given) > 0.1
+
+
+def test_the_scaling_of_inputs_is_not_learned():
+    policy, data = controller(dropout.none()), with_entry(LARGE["varies"])
+    params = policy.adapt(policy.init(jax.random.key(0)), data)
+    slope = jax.grad(lambda params: jnp.sum(policy.apply(params, None, data.x[0]) ** 2))(params)
+    assert not any(np.any(leaf) for leaf in slope["input"])
+    assert optax.tree.norm(slope["network"]) > 0
+    white = scaled(params["input"], encode(data.x[:30], (2,)))[:, 0]
+    np.testing.assert_allclose((white.mean(), white.std()), (0, 1), atol=1e-2)
+
+
+def test_a_fresh_policy_among_others_has_the_inputs_of_the_given_one():
+    policy, data = controller(dropout.none()), with_entry(LARGE["constant"])
+    given, fresh = policy.adapt(policy.init(jax.random.key(0)), data), policy.init(jax.random.key(1))
+    assert same(inherited(fresh, given), policy.adapt(fresh, data))
+    assert inherited(3.0, 4.0) == 3.0

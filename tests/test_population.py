@@ -43,7 +43,7 @@ def descent():
 
 def found(own, others, key=0, calls=1):
     """(learner, info) of a search of 60 iterations in so many calls."""
-    fresh = lambda key: jax.random.choice(key, jnp.asarray(others))  # noqa: E731
+    fresh = lambda key, given: jax.random.choice(key, jnp.asarray(others))  # noqa: E731
     searcher = best_of(descent(), fresh, starts=STARTS, window=STEPS // 20)
     learner = Learner(jnp.float32(own), searcher.init(jnp.float32(own)))
     run, info = jax.jit(partial(searcher.run, steps=STEPS // calls)), None
@@ -88,7 +88,7 @@ def test_every_search_has_fresh_policies_of_its_own():
 
 
 def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_each():
-    fresh = lambda key: jax.random.uniform(key, minval=-2.0, maxval=2.0)  # noqa: E731
+    fresh = lambda key, given: jax.random.uniform(key, minval=-2.0, maxval=2.0)  # noqa: E731
 
     def members(lasting):
         """After a search of 3 iterations, and after one more, with another key."""

@@ -102,9 +102,14 @@ def test_the_last_episode_counts_though_it_has_no_row(run: Path) -> None:
     assert restore.best(run) == 2
     task, cheap = record.task_of(run), record.load_episode(run, 3)
     assert cheap is not None
-    record.save_episode(run, 4, cheap._replace(cost=0.01 * cheap.cost), task, policy=3, ended="horizon")
+    good = cheap.trajectory._replace(cost=0.01 * cheap.trajectory.cost)
+    record.save_episode(run, 4, good, task, policy=3, ended="horizon")
     assert restore.best(run) == 3
-    record.save_episode(run, 4, cheap._replace(cost=0.01 * cheap.cost), task, policy=3, ended="error")
+    record.save_episode(run, 4, good, task, policy=3, ended="error")
+    assert restore.best(run) == 2
+    # One that ended early pays for what it left out.
+    short = good._replace(x=good.x[:3], u=good.u[:2], cost=good.cost[:2])
+    record.save_episode(run, 4, short, task, policy=3, ended="terminated")
     assert restore.best(run) == 2
 
 

@@ -11,12 +11,10 @@ import time
 from pathlib import Path
 
 import gymnasium
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_envs.guest import facts, guest
+from pegasus_envs.gym_plant import env_spec
 from pegasus_jax import controller, record, settings, study
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
@@ -86,14 +84,14 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = tmp_path_factory.mktemp("robot")
     code, _, err = call("train", *WORDS, *TINY, "horizon=5", "out=run", cwd=home)
     assert code == 0, err
-    assert "cost of its episode" in err
+    assert "episode by the policy of trial 1: cost" in err
     return home
 
 
 def test_a_robot_moves_for_the_episodes_that_are_data_and_for_nothing_else(learned: Path) -> None:
-    """A reset and a horizon of steps a trial; going on opens it again, looking at the run does not."""
+    """One reset to check it, a reset and a horizon of steps a trial; going on opens it again, a look at the run not."""
     trial = ["reset", *["step"] * 5]
-    assert asked(learned) == [*trial, *trial, "close"]
+    assert asked(learned) == ["reset", *trial, *trial, "close"]
     rows = record.trials(learned / "run")
     assert [(row["mean_cost"], row["success_rate"]) for row in rows] == [(None, None)] * 2
     assert all(0 <= row["episode_cost"] <= 1 for row in rows)
@@ -124,20 +122,28 @@ def test_what_it_learned_is_a_function(learned: Path, monkeypatch: pytest.Monkey
 
 
 def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None:
-    """In the second of two episodes of five steps. The first is kept, no step follows, and resuming does the rest."""
+    """In the second of two episodes of five steps. Its two whole rows are kept, and resuming learns from them."""
     code, _, err = call("train", *WORDS, *TINY, "horizon=5", "out=run", cwd=tmp_path, BREAKS=8)
     assert (code, "Traceback" in err) == (2, False), err
     assert re.fullmatch(
         r"pegasus: robot:Watched-v0 failed in an episode, OSError: the motor driver does not answer \(robot.py:\d+\);"
-        " resume=run goes on from trial 2",
+        " its 2 rows are kept; resume=run goes on",
         err.splitlines()[-1],
     )
-    assert asked(tmp_path) == ["reset", *["step"] * 5, "reset", *["step"] * 3, "close"]
-    first = record.load_episode(tmp_path / "run", 1)
-    assert (first is None, record.load_episode(tmp_path / "run", 2)) == (False, None)
-    code, _, err = call("train", "resume=run", cwd=tmp_path)
+    assert asked(tmp_path) == ["reset", "reset", *["step"] * 5, "reset", *["step"] * 3, "close"]
+    cut = record.load_episode(tmp_path / "run", 2)
+    assert cut is not None
+    assert (cut.ended, cut.trajectory.x.shape, cut.trajectory.u.shape) == ("error", (3, 2), (2, 1))
+    code, _, err = call("train", "resume=run", "final=true", cwd=tmp_path)
+    # The episode that was cut short is learned from; the last policy's own is the only one that moves the robot.
     assert (code, asked(tmp_path)) == (0, ["reset", *["step"] * 5, "close"]), err
-    assert len(record.trials(tmp_path / "run")) == 2
+    assert [(row["steps"], row["ended"], row["policy"]) for row in record.trials(tmp_path / "run")] == [
+        (5, "horizon", 0),
+        (2, "error", 1),
+    ]
+    assert int(restored(tmp_path / "run")[2].data.size) == 7
+    code, _, err = call("train", "resume=run", "trials=3", cwd=tmp_path)
+    assert (code, asked(tmp_path)) == (0, []), err
 
 
 @pytest.mark.parametrize(
@@ -161,8 +167,8 @@ def test_ctrl_c_in_the_middle_of_an_episode(tmp_path: Path) -> None:
         time.sleep(0.1)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
-    assert (process.returncode, "Traceback" in err) == (1, False), err
-    assert err.splitlines()[-1].startswith("stopped; every finished episode is kept")
+    assert (process.returncode, "Traceback" in err) == (130, False), err
+    assert err.splitlines()[-1] == "stopped; every finished episode is kept, pegasus-train resume=run goes on"
     assert asked(tmp_path)[-1] == "close"
 
 
@@ -176,45 +182,23 @@ class Bounds(gymnasium.Env):
         raise AssertionError("it was reset")
 
 
-class Sensors(gymnasium.Env):
-    """Three sensors, of which the second has lost its wire in the fourth step; it counts its steps."""
-
-    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (3,))
-    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
-    steps = 0
-
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        return np.zeros(3), {}
-
-    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        Sensors.steps += 1
-        return np.array([0.0, np.nan if Sensors.steps == 4 else 0.0, 0.0]), 0.0, False, False, {}
-
-
-def test_no_control_follows_from_an_observation_that_is_not_finite() -> None:
-    gymnasium.register("Sensors-v0", Sensors)
-    plant = guest("Sensors-v0", 3)
-    step = lambda x, _: (plant.step(x, jnp.zeros(1)), None)  # noqa: E731
-    with pytest.raises(jax.errors.JaxRuntimeError):
-        jax.block_until_ready(jax.jit(lambda key: jax.lax.scan(step, plant.reset(key), None, 9)[0])(jax.random.key(0)))
-    assert Sensors.steps == 4
-    assert [str(error) for error in plant.trouble] == ["entry 1 of its observation is nan"]
-    assert not hasattr(plant.trouble[0], "__notes__")  # no line of theirs is to blame
-
-
 def test_facts_that_are_given_are_not_asked_for() -> None:
     gymnasium.register("Bounds-v0", Bounds)
-    known = facts("Bounds-v0", control_low=[-3, -0.5], control_high=[2, 1], dt=0.1, start_mean=[1, 2], start_std=[0.1])
+    known = env_spec(
+        "Bounds-v0", control_low=[-3, -0.5], control_high=[2, 1], dt=0.1, start_mean=[1, 2], start_std=[0.1]
+    )
     np.testing.assert_array_equal(known.control_low, [-3, -0.5])
     np.testing.assert_array_equal(known.control_high, [2, 1])
     np.testing.assert_array_equal(known.start_std, [0.1, 0.1])
     assert (known.dt, known.horizon) == (0.1, 100)
     with pytest.raises(ValueError, match="give control_low= and control_high="):
-        facts("Bounds-v0", start_mean=[0])
+        env_spec("Bounds-v0", start_mean=[0, 0])
     with pytest.raises(ValueError, match="controls from -2 to 2 are not among its own, from -1 to 1"):
-        facts("Bounds-v0", control_low=[-2], control_high=[2], start_mean=[0])
+        env_spec("Bounds-v0", control_low=[-2], control_high=[2], start_mean=[0, 0])
     with pytest.raises(ValueError, match="start_mean has 3 entries; expected 2"):
-        facts("Bounds-v0", control_low=[-1], control_high=[1], start_mean=[0, 0, 0])
+        env_spec("Bounds-v0", control_low=[-1], control_high=[1], start_mean=[0, 0, 0])
+    with pytest.raises(ValueError, match="start_mean has 1 entries; expected 2"):
+        env_spec("Bounds-v0", control_low=[-1], control_high=[1], start_mean=[0])
 
 
 def test_runs_that_were_not_evaluated_have_no_curves_to_compare(learned: Path) -> None:

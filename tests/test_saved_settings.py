@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax import config, settings
+from pegasus_jax import config, config_models, settings
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
 from pegasus_jax.tasks import TASKS
@@ -27,11 +27,11 @@ configs = st.builds(
         low=st.floats(-20, -0.1),
         high=st.floats(0, 3),
         hidden=layers,
-        dropout=st.sampled_from(config.DROPOUTS),
+        dropout=st.sampled_from(config_models.DROPOUTS),
         rate=st.floats(0, 0.99),
         input_noise=st.booleans(),
         heteroscedastic=st.booleans(),
-        head=st.sampled_from(config.HEADS),
+        head=st.sampled_from(config_models.HEADS),
         whitening=st.sampled_from(["full", "diagonal"]),
         weight_decay=st.floats(0, 10),
         initialiser=st.sampled_from(config.INITIALISERS),
@@ -62,7 +62,7 @@ configs = st.builds(
         cost_noise=st.floats(0, 10),
         period=st.builds(Period, *[whole(0)] * 5),
     ),
-    explore=st.builds(Explore, trials=whole(0), kind=st.sampled_from(config.EXPLORATIONS)),
+    explore=st.builds(Explore, trials=st.integers(0, 10**4), kind=st.sampled_from(config.EXPLORATIONS)),
 )
 
 

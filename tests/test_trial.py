@@ -11,7 +11,7 @@ from pegasus_jax.build import compose
 from pegasus_jax.config import Period
 from pegasus_jax.trial import COLLECT, EVALUATE, FIT, IMAGINE, RESTART, SEARCH, TrialInfo, run, trial_key
 from pegasus_jax.types import Policy, Prediction
-from probes import Counter, cart, dial, noisy_linear_policy, regression, same, tiny, unchecked
+from probes import Counter, Linear, cart, dial, known, noisy_linear_policy, regression, same, tiny, unchecked
 
 TRIALS, EPISODES = 3, 4
 QUICK = dict(trials=TRIALS, fit__steps=12, search__steps=6, search__particles=5)
@@ -32,7 +32,7 @@ class Watched:
         )
         self.init, self.collect = jax.jit(self.exp.init), jax.jit(self.exp.collect)
         self.absorb, self.fit = jax.jit(self.exp.absorb), jax.jit(self.exp.fit)
-        self.search = jax.jit(self.exp.search)
+        self.search, self.succeed = jax.jit(self.exp.search), jax.jit(self.exp.succeed)
         self.episodes = unchecked(jax.jit(jax.vmap(self.exp.episode, (0, None, None))))
 
     def traces(self):
@@ -52,7 +52,9 @@ def loop(watched, seed):
         trajectory = watched.collect(state)
         state = watched.absorb(state, trajectory)
         state, fitted = watched.fit(state)
+        incumbent = state.policy.params
         state, searched = watched.search(state)
+        state, _ = watched.succeed(state, incumbent)
         keys = jax.random.split(trial_key(state.key, state.trial, EVALUATE), EPISODES)
         evaluation = watched.episodes(keys, state.policy.params, False)
         states.append(state)
@@ -121,7 +123,9 @@ def test_a_trial_is_a_function_of_state_alone(watched, looped):
     trajectory = watched.collect(states[2])
     assert same(trajectory, infos[2].trajectory)
     state, fitted = watched.fit(watched.absorb(states[2], trajectory))
+    incumbent = state.policy.params
     state, searched = watched.search(state)
+    state, _ = watched.succeed(state, incumbent)
     assert same(state, states[3])
     assert same((fitted, searched), infos[2][2:])
 
@@ -310,3 +314,61 @@ def test_random_episodes_come_before_any_learning():
     learned = again(kept)
     assert not same(learned.policy, first.policy)
     close(again(learned), last)
+
+
+@pytest.mark.parametrize("better", [True, False])
+@pytest.mark.parametrize("compare", ["better", "always"])
+def test_a_successor_takes_over_where_it_is_expected_to_cost_less(better, compare):
+    """Fresh scenarios under the new model: a policy of gain 0 does nothing for a cart that a gain of -1 stops."""
+    task = cart()
+    true = Linear(np.array([[1, 0.3], [0, 1]]), np.array([[0.045], [0.3]]), np.eye(2), np.zeros(2), np.zeros(2), 8)
+    exp = compose(tiny(**QUICK, successor=compare), task, known(true), noisy_linear_policy(task))
+    state = exp.init(jax.random.key(0))
+    idle, good = jnp.zeros((1, 2)), jnp.array([[-0.8, -1.2]])
+    new, old = (good, idle) if better else (idle, good)
+    state = state._replace(policy=state.policy._replace(params=new), trial=jnp.int32(4), policy_trial=jnp.int32(3))
+    after, found = jax.jit(exp.succeed)(state, old)
+    replaced = better or compare == "always"
+    assert bool(found.replaced) == replaced
+    assert same(after.policy.params, new if replaced else old)
+    assert int(after.policy_trial) == (4 if replaced else 3)
+    assert np.isnan(found.incumbent) == (compare == "always")
+    if compare == "better":
+        assert (float(jnp.mean(found.cost)) < float(found.incumbent)) == better
+        # What has never learned anything is no incumbent.
+        first, found = jax.jit(exp.succeed)(state._replace(policy_trial=jnp.int32(0)), old)
+        assert (int(first.policy_trial), bool(found.replaced)) == (4, True)
+
+
+def test_an_episode_that_is_none_of_the_tasks_is_refused(watched, looped):
+    state, trajectory = looped[0][0], looped[1][0].trajectory
+    absorb = watched.exp.absorb
+    with pytest.raises(ValueError, match=r"x has shape \(9, 3\); expected \(9, 2\)"):
+        absorb(state, trajectory._replace(x=jnp.zeros((9, 3))))
+    with pytest.raises(ValueError, match=r"cost has shape \(7,\); expected \(8,\)"):
+        jax.jit(absorb)(state, trajectory._replace(cost=jnp.zeros(7)))
+    with pytest.raises(ValueError, match=r"u\[3, 0\] is nan"):
+        absorb(state, trajectory._replace(u=trajectory.u.at[3, 0].set(jnp.nan)))
+    absorb(state, trajectory._replace(u=trajectory.u.at[3, 0].set(jnp.nan), length=jnp.int32(3)))
+    full = looped[0][TRIALS]
+    with pytest.raises(ValueError, match="an episode of 8 rows does not fit: 0 are left"):
+        absorb(full, trajectory)
+    kept = watched.absorb(full, trajectory)  # inside jit nobody can be told, and nothing is lost
+    assert same(kept.data, full.data)
+
+
+def test_an_episode_that_ends_early_teaches_its_own_rows(watched, looped):
+    """The rows behind its end say nothing: neither the data nor the model's calibration depends on them."""
+    state, trajectory = looped[0][1], looped[1][1].trajectory
+    short, other = (
+        trajectory._replace(x=trajectory.x.at[6:].set(rows), u=trajectory.u.at[5:].set(rows), length=jnp.int32(5))
+        for rows in (0.0, 7.0)
+    )
+    once, again = (watched.absorb(state, episode).data for episode in (short, other))
+    assert same(once, again)
+    assert int(once.size) == 8 + 5
+    assert np.array_equal(once.x[8:13], trajectory.x[:5])
+    assert not np.any(once.x[13:])
+    calibrate = jax.jit(watched.exp.calibrate)
+    assert float(calibrate(looped[0][1], short)) == float(calibrate(looped[0][1], other))
+    assert float(calibrate(looped[0][1], short)) != float(calibrate(looped[0][1], trajectory))

@@ -97,3 +97,58 @@ def test_the_factor_is_lower_triangular_and_in_units_of_the_data(scale):
     assert np.array_equal(np.asarray(w.root), np.tril(w.root))
     expected = np.linalg.cholesky(np.cov(rows.astype(np.float64).T, bias=True))
     np.testing.assert_allclose(w.root, expected, rtol=2e-3, atol=2e-3 * scale)
+
+
+@given(seeds)
+def test_what_dependent_columns_need_changes_nothing_where_there_are_none(seed):
+    """To the last bit, against a whitener that takes every column for a free one."""
+    rows = jnp.asarray(correlated(seed))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(module, "independent", lambda correlation: jnp.ones(F, bool))
+        expected = module.whitener(rows, jnp.int32(N))
+    for found, value in zip(module.whitener(rows, jnp.int32(N)), expected, strict=True):
+        assert np.array_equal(found, value)
+
+
+def repeated(rows, how):
+    """The columns [N, F] with one more that follows from them, or never changes."""
+    first, second = rows[:, 0], rows[:, 1]
+    made = {
+        "twice": first,
+        "degrees": np.rad2deg(first),
+        "both": 3 * first - second + 1,
+        "enlarged": 1e4 * first,
+        "reduced": 1e-4 * first,
+        "offset": 1000 + 500 * first,
+        "constant": np.full_like(first, 0.7),
+        "large": np.full_like(first, 1e4),
+    }
+    return np.column_stack([rows, made[how]]).astype(np.float32)
+
+
+@pytest.mark.parametrize("how", ["twice", "degrees", "both", "enlarged", "reduced", "offset", "constant", "large"])
+@given(seed=seeds)
+def test_what_follows_from_other_columns_is_not_enlarged(how, seed):
+    """White rows are the data again, and a step off the data's plane, as imagined states take, stays a small one."""
+    rows = repeated(correlated(seed), how)
+    w = whitener(jnp.asarray(rows), jnp.int32(N))
+    white = np.asarray(whiten(w, jnp.asarray(rows)))
+    assert np.abs(white).max() < 20
+    scale = np.abs(rows).max(0)
+    np.testing.assert_allclose(unwhiten(w, white) / scale, rows / scale, atol=2e-4)
+    if how in ("twice", "degrees", "both", "enlarged", "reduced", "offset"):
+        assert not module.independent(jnp.corrcoef(rows.T))[-1]
+        off = whiten(w, jnp.asarray(rows + 0.1 * rows.std(0) * np.eye(F + 1, dtype=np.float32)[-1]))
+        assert np.abs(np.asarray(off) - white).max() < 0.2
+
+
+def test_several_dependent_columns_leave_the_free_ones_as_they_are():
+    rows = correlated(4)
+    more = np.column_stack([rows, rows @ np.array([1.0, 2.0, 0.0]), rows @ np.array([0.0, 1.0, -1.0])]).astype(
+        np.float32
+    )
+    free = module.independent(jnp.corrcoef(more.T))
+    assert free.tolist() == [True, True, True, False, False]
+    one, two = (whitener(jnp.asarray(r), jnp.int32(N)) for r in (rows, more))
+    np.testing.assert_allclose(two.root[:F, :F], one.root, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(np.abs(two.root[F:, :F]), 0, atol=1e-5)

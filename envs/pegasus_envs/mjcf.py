@@ -19,6 +19,9 @@ from pegasus_envs.physics import mjx
 from pegasus_envs.plant import FRAME, draw_start, filled
 
 _ENTRY = re.compile(r"(qpos|qvel)\.(\d+)")
+LONGEST = 10_000  # time steps of a control period
+# Flags that only ask for numbers that nobody here reads; MJX refuses them.
+_HARMLESS = int(mujoco.mjtEnableBit.mjENBL_ENERGY) | int(mujoco.mjtEnableBit.mjENBL_FWDINV)
 _UNITS = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
 
 
@@ -84,8 +87,10 @@ def mechanism(
     if count < 1 or abs(count * model.opt.timestep - dt) > 1e-6 * dt:
         near = max(count, 1) * model.opt.timestep
         raise ValueError(f"dt={dt:g} is not a whole number of its time steps of {model.opt.timestep:g} s; try {near:g}")
+    if count > LONGEST:
+        raise ValueError(f"dt={dt:g} is {count} of its time steps; the most is dt={LONGEST * model.opt.timestep:g}")
     rest = np.concatenate([model.qpos0, np.zeros(model.nv)])
-    mean = filled("start_mean", start_mean, len(entries), rest[entries])
+    mean = filled("start_mean", start_mean, len(entries), rest[entries], each=True)
     std = filled("start_std", start_std, len(entries), np.zeros(len(entries)))
     device, blank = _on_device(model)
 
@@ -120,7 +125,7 @@ def mechanism(
         dt=dt,
         start_mean=mean,
         start_std=std,
-        state_names=tuple(_state_names(model)[entry] for entry in entries),
+        state_names=tuple(full_state_names(model)[entry] for entry in entries),
         control_names=tuple(model.actuator(i).name or f"u{i}" for i in range(model.nu)),
         model=model,
         qpos=lambda state: state.qpos,
@@ -143,11 +148,23 @@ def read(path: Path) -> mujoco.MjModel:
         raise ValueError(f"MuJoCo cannot read it: {' '.join(str(error).split())}") from error
     if not model.nu:
         raise ValueError("it has no actuators, so there is nothing to control")
-    if np.any(model.geom_fluid[:, 0] > 0) and (model.opt.density > 0 or model.opt.viscosity > 0):
-        raise ValueError("MJX ignores fluidshape='ellipsoid'; leave it out for the drag on inertia boxes")
-    if model.nplugin:
-        raise ValueError("MJX has no plugins")
+    for what in ignored(model):
+        raise ValueError(f"MJX ignores {what}")
+    model.opt.enableflags &= ~_HARMLESS
     return model
+
+
+def ignored(model: mujoco.MjModel) -> list[str]:
+    """What of a model MJX passes over without a word, and what to do about it."""
+    found = {
+        "fluidshape='ellipsoid'; leave it out for the drag on inertia boxes": np.any(model.geom_fluid[:, 0] > 0)
+        and (model.opt.density > 0 or model.opt.viscosity > 0),
+        "plugins; leave them out": model.nplugin,
+        "delay of an actuator; leave it out, and let dt= be no shorter": np.any(model.actuator_delay),
+        "actuatorgroupdisable; leave the actuators out": model.opt.disableactuator,
+        "noslip_iterations; leave them out": model.opt.noslip_iterations,
+    }
+    return [what for what, there in found.items() if there]
 
 
 def digest(model: mujoco.MjModel) -> str:
@@ -199,7 +216,7 @@ def _limits(model: mujoco.MjModel, low: Sequence[float], high: Sequence[float]) 
     return lows, highs
 
 
-def _state_names(model: mujoco.MjModel) -> list[str]:
+def full_state_names(model: mujoco.MjModel) -> list[str]:
     """Names of positions, then velocities: a joint's where it is a hinge or a slide, else the entry's."""
     positions, rates = [f"qpos.{i}" for i in range(model.nq)], [f"qvel.{i}" for i in range(model.nv)]
     for i in range(model.njnt):

@@ -78,10 +78,13 @@ def draw_start(key: Array, mean: np.ndarray, std: np.ndarray) -> Array:
     return jnp.asarray(mean) + jnp.asarray(std) * jax.random.normal(key, mean.shape)
 
 
-def filled(setting: str, given: Sequence[float], size: int, default: np.ndarray) -> np.ndarray:
-    """The numbers given for a setting, one for all or one each [size], or the default. Raises ValueError for others."""
-    if len(given) not in (0, 1, size):
-        raise ValueError(f"{setting} has {len(given)} entries; expected {size}, or one for all")
+def filled(setting: str, given: Sequence[float], size: int, default: np.ndarray, each: bool = False) -> np.ndarray:
+    """The numbers [size] given for a setting, or the default. Raises ValueError for another count of them.
+
+    One number is for all, unless there must be one for `each`.
+    """
+    if len(given) not in (0, size) and (each or len(given) != 1):
+        raise ValueError(f"{setting} has {len(given)} entries; expected {size}{'' if each else ', or one for all'}")
     return np.broadcast_to(np.asarray(given, float), (size,)).copy() if len(given) else np.asarray(default, float)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jax.sharding import Mesh
 
-from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco, scenarios, tasks, trial
+from pegasus_jax import angles, cost, dropout, episode, gaussian, moments, pilco, scenarios, tasks
 from pegasus_jax import config as settings
 from pegasus_jax.checks import SettingError
 from pegasus_jax.cost import of_particles
@@ -26,10 +26,12 @@ from pegasus_jax.noisy import HEADS
 from pegasus_jax.policy.linear import linear
 from pegasus_jax.policy.mlp import mlp
 from pegasus_jax.policy.rbf import rbf
+from pegasus_jax.policy.scaled import inherited
 from pegasus_jax.policy.squash import SQUASHES, to_limits
 from pegasus_jax.population import best_of
 from pegasus_jax.rollout import NoiseUse, rollout
 from pegasus_jax.search import keeping_best, objective, particles, remembering
+from pegasus_jax.trial import experiment
 from pegasus_jax.types import (
     Array,
     Dropout,
@@ -80,7 +82,7 @@ def compose(
     searcher, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)
     explore = config.explore
-    return trial.experiment(
+    return experiment(
         task=task,
         dynamics=dynamics,
         policy=policy,
@@ -94,6 +96,7 @@ def compose(
         imagine=imagine,
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
+        compare=config.successor == "better",
         mean_execution=config.policy.execution == "mean",
         capacity=config.trials * task.horizon,
     )
@@ -188,10 +191,11 @@ def search_of(
     if search.starts > 1:
         lasting = search.anneal > 1  # one course for all searches: who began late would be behind
         window = 1 if search.refine else max(1, search.steps // 20)  # what refines may end with another than its last
-        searcher = best_of(searcher, policy.init, starts=search.starts, window=window, lasting=lasting)
+        fresh = lambda key, given: inherited(policy.init(key), given)  # noqa: E731
+        searcher = best_of(searcher, fresh, starts=search.starts, window=window, lasting=lasting)
     # A refined policy is good for particles, not for their Gaussian.
     seen_last = match if refine is None else moments.keep
-    return searcher, partial(imagined, **pieces, match=seen_last, blocks=blocks, cost=task.cost)
+    return searcher, partial(imagined, **pieces, match=seen_last, blocks=blocks, task=task)
 
 
 def analytic_search_of(
@@ -203,6 +207,8 @@ def analytic_search_of(
     noise: NoiseUse,
 ) -> tuple[Searcher, Imagine]:
     """PILCO's search. Raises SettingError where a piece has no moments."""
+    if task.stop is not None:
+        raise SettingError("algorithm=pilco propagates a Gaussian, which cannot stop; leave out stop=")
     if dynamics.moments is None:
         raise SettingError("algorithm=pilco needs a model with analytic moments: model=ssgp, model=gp")
     if policy.moments is None:
@@ -233,7 +239,7 @@ def analytic_search_of(
 
     begin, expected = (mean, jnp.diag(std**2)), expected_cost_of(task)
     blocks = blocks_of(search.particles, task, dynamics, policy)
-    imagine = partial(imagined, **pieces, blocks=blocks, cost=task.cost, match=moments.keep, noise=noise)
+    imagine = partial(imagined, **pieces, blocks=blocks, task=task, match=moments.keep, noise=noise)
     return pilco.analytic(value, noise_std), imagine
 
 
@@ -254,10 +260,19 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
             of_state, expected = task.widened(width)
         each = cost.of_particles(of_state)
         if search.cost != "matched":
-            return each
-        return either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), cost.of_matched(expected))
+            return until_stop(task, each)
+        return until_stop(
+            task, either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), cost.of_matched(expected))
+        )
 
     return costs
+
+
+def until_stop(task: Task, costs: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """The costs of particles that end where the task's episodes do."""
+    if task.stop is None:
+        return costs
+    return lambda x: cost.until_stop(costs(x), x, task.stop, task.stop_cost)  # type: ignore[arg-type]
 
 
 def expected_cost_of(task: Task) -> cost.Expected:
@@ -296,12 +311,12 @@ def imagined(
     belief: Params,
     *,
     blocks: scenarios.Blocks,
-    cost: Callable[[Array], Array],
+    task: Task,
     **pieces: Any,
 ) -> tuple[Rollout, Array]:
     """Rollouts under fresh scenarios and the cost of every particle [H, K]."""
     rolled = rollout(params, belief, scenarios.draw(key, 0, belief, blocks=blocks, period=Period()), **pieces)
-    return rolled, of_particles(cost)(rolled.seen)
+    return rolled, until_stop(task, of_particles(task.cost))(rolled.seen)
 
 
 def start(key: Key, *, task: Task) -> Array:

@@ -19,7 +19,11 @@ def calibration(
     dimensions, of squared error / predictive variance, divided by its value for Gaussian errors of the predicted size;
     the median, because a few steps outside the data would decide a mean.
     """
-    return overconfidence(*one_step_errors(key, belief, trajectory, dynamics=dynamics, angles=angles, draws=draws))
+    error, variance = one_step_errors(key, belief, trajectory, dynamics=dynamics, angles=angles, draws=draws)
+    if trajectory.length is None:
+        return overconfidence(error, variance)
+    took_place = (jnp.arange(error.shape[0]) < trajectory.length)[:, None]
+    return jnp.sqrt(jnp.nanmedian(jnp.where(took_place, error**2 / variance, jnp.nan))) / HALF
 
 
 def overconfidence(error: Array, variance: Array) -> Array:

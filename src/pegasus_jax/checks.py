@@ -1,9 +1,32 @@
 """What is raised of a value that cannot be, and the checks that raise it: one line, with the nearest valid choice."""
 
+import dataclasses
 import difflib
 import math
+import numbers
 from collections.abc import Iterable
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_origin
+
+# The greatest of each size that a setting may ask for: beyond is a slip of the keyboard, and no machine's work.
+SIZES = {
+    "steps": 10**7,
+    "particles": 10**6,
+    "batch": 10**6,
+    "hidden": 10**5,
+    "points": 10**5,
+    "features": 10**5,
+    "units": 10**5,
+    "starts": 10**4,
+    "members": 10**3,
+    "substeps": 10**3,
+    "anneal": 10**4,
+    "horizon": 10**5,
+    "evaluation": 10**5,
+    "trials": 10**4,
+    "rows": 10**7,
+    "dt": 10**4,
+}
 
 
 class SettingError(ValueError):
@@ -32,7 +55,7 @@ def within(name: str, value: float, low: float, high: float = math.inf, *, open_
     """Raises SettingError unless low <= value <= high, or low < value, and it is finite."""
     if not math.isfinite(value) or value > high or value < low or (open_low and value == low):
         interval = f"{'(' if open_low else '['}{number(low)}, {number(high)}{')' if high == math.inf else ']'}"
-        nearest_value = min(max(value, low), high) if math.isfinite(value) and not open_low else None
+        nearest_value = min(max(value, low), high) if math.isfinite(value) and (not open_low or value > high) else None
         hint = f"; the nearest is {number(nearest_value)}" if nearest_value is not None else ""
         raise SettingError(f"{name}={number(value)} is out of range; expected a number in {interval}{hint}")
 
@@ -48,14 +71,105 @@ def number(value: float) -> str:
     return str(int(value)) if math.isfinite(value) and value == int(value) else f"{value:g}"
 
 
-def layers(name: str, value: Any) -> tuple[int, ...]:
-    """The widths of hidden layers. Raises SettingError unless they are whole numbers from 1."""
-    widths = tuple(value)
+def size(name: str, value: int, low: int = 1) -> None:
+    """Raises SettingError unless a size, the last part of the setting's name in SIZES, is at least `low` and sane."""
+    within(name, value, low, SIZES[name.rpartition(".")[2]])
+
+
+def sizes(section: str, config: Any, *names: str, low: int = 1) -> None:
+    """`size` of each of these settings of a section."""
+    for name in names:
+        size(f"{section}.{name}" if section else name, getattr(config, name), low)
+
+
+def rows(trials: int, horizon: int | None) -> None:
+    """Raises SettingError where episodes make more data than SIZES allows."""
+    most = SIZES["rows"]
+    if trials * (horizon or 1) > most:
+        raise SettingError(
+            f"trials={trials} of horizon={horizon} are more than {most:,} rows of data;"
+            f" the nearest is trials={most // (horizon or 1)}"
+        )
+
+
+def layers(name: str, widths: tuple[int, ...]) -> None:
+    """Raises SettingError unless these are widths of hidden layers."""
     for width in widths:
-        if not isinstance(width, int):
-            raise SettingError(f"{name}={list(widths)} is not a list of whole numbers; for example {name}=[200,200]")
-        within(name, width, 1)
-    return widths
+        within(name, width, 1, SIZES["hidden"])
+    within(f"number of {name}", len(widths), 0, 100)
+
+
+def finite(name: str, values: Iterable[float]) -> None:
+    """Raises SettingError unless each of these is a finite number."""
+    for value in values:
+        if not math.isfinite(value):
+            raise SettingError(f"{name}={value} is not a finite number")
+
+
+def different(name: str, values: tuple[Any, ...]) -> None:
+    """Raises SettingError where one of these is there twice."""
+    for value in values:
+        if values.count(value) > 1:
+            once = ",".join(map(str, dict.fromkeys(values)))
+            raise SettingError(f"{name}=[{','.join(map(str, values))}] names {value} twice; the nearest is [{once}]")
+
+
+def typed(section: str, node: Any) -> None:
+    """Makes each field of a config dataclass the type that it is declared as; lists become tuples.
+
+    Raises SettingError where it is of another type, in one line that names the setting and its default.
+    """
+    for f in dataclasses.fields(node):
+        given = getattr(node, f.name)
+        value = _as(f.type, given)
+        if value is _WRONG:
+            name = f"{section}.{f.name}" if section else f.name
+            raise SettingError(f"{name}={shown(given)} is not {called(f.type)}; for example {name}={shown(f.default)}")
+        object.__setattr__(node, f.name, value)
+
+
+_WRONG = object()
+
+
+def _as(kind: Any, value: Any) -> Any:
+    """The value as this type, or _WRONG."""
+    if get_origin(kind) is UnionType or isinstance(kind, UnionType):
+        return next((found for part in get_args(kind) if (found := _as(part, value)) is not _WRONG), _WRONG)
+    if get_origin(kind) is tuple:
+        parts = [_as(get_args(kind)[0], part) for part in value] if isinstance(value, tuple | list) else [_WRONG]
+        return _WRONG if _WRONG in parts else tuple(parts)
+    if kind in (int, float):
+        number: Any = numbers.Integral if kind is int else numbers.Real
+        return kind(value) if isinstance(value, number) and not isinstance(value, bool) else _WRONG
+    return value if isinstance(value, kind) else _WRONG
+
+
+def called(kind: Any) -> str:
+    """A setting's type in words."""
+    return {
+        int: "a whole number",
+        float: "a number",
+        bool: "true or false",
+        str: "a word",
+        tuple[int, ...]: "a list of whole numbers",
+        tuple[float, ...]: "a list of numbers",
+        tuple[str, ...]: "a list of words",
+        str | None: "a word or null",
+        int | None: "a whole number or null",
+        float | None: "a number or null",
+    }.get(kind, "one of its kinds")
+
+
+def shown(value: Any) -> str:
+    """A setting's value as the command line has it."""
+    if value is None:
+        return "null"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple | list):
+        return "[" + ",".join(map(shown, value)) + "]"
+    words = f"{value:g}" if isinstance(value, float) else str(value)
+    return words if words.isprintable() else repr(words)
 
 
 def kind(section: str, value: str, kind: str) -> None:

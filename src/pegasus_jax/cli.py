@@ -1,4 +1,4 @@
-"""The commands: pegasus-train, -eval, -plot, -play, -figures. Each reads `key=value` words and ends with 0, 1 or 2."""
+"""The commands pegasus-train, -check, -eval, -plot, -play, -figures: they read `key=value` words end with 0 to 2."""
 
 import json
 import os
@@ -9,8 +9,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pegasus_jax import cache, files
-from pegasus_jax.checks import SettingError
+from pegasus_jax import cache, files, interrupt
+from pegasus_jax.checks import SIZES, SettingError, within
 from pegasus_jax.config import Search
 
 TRAIN = """\
@@ -19,11 +19,12 @@ pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that 
                                                 fit.* or search.* settings
 
   task=cartpole         what to learn: {tasks}
-  model=log_normal      dynamics model: {models};
-                        with task=cartpole it is lagrangian unless you say otherwise
+  model=log_normal      dynamics model: {models}
+                        (default: the one that learns the task best, of cartpole and double_cartpole lagrangian)
   policy=mlp            controller: {policies}
   algorithm=pegasus     how to search: {algorithms}
   out=runs/...          the run's folder (default: runs/TASK-seedN)
+  final=true            run the last policy for one more episode, which is data if the run goes on
   seeds=1               so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN
   mesh=SEEDSxPARTICLES  the devices that share seeds and particles (default: as many GPUs, or cores of a CPU, as share
                         the seeds evenly)
@@ -34,6 +35,9 @@ A task and a named variant bring their own values of the settings below, which c
 they are with the words beside --help: pegasus-train task=gym algorithm=paper --help
 {settings}
 {others}
+PEGASUS_SETTINGS="fit.steps=5 search.steps=5" in the environment adds these words to every pegasus-train and
+pegasus-figures command, after those that are typed: of two values of a setting, the last one counts.
+
 examples
   pegasus-train task=cartpole
   pegasus-train task=cartpole policy.hidden=[50,50] seed=3 trials=10 out=runs/demo
@@ -45,8 +49,21 @@ examples
   pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
   pegasus-train resume=runs/demo trials=20 search.steps=2000
 
-Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN, pegasus-play RUN, or
-tensorboard --logdir RUN/tensorboard.
+Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN or pegasus-play RUN; or with
+tensorboard --logdir RUN/tensorboard, after pip install tensorboard.
+"""
+
+CHECK = """\
+pegasus-check task=NAME [setting=value ...]     look at a task before it is learned
+
+Takes the words of pegasus-train, which looks first itself. Opens the environment, resets it once, drives nothing and
+closes it; without start_mean= it is reset more often, as pegasus-train does. Prints spaces, limits, control period,
+start and the cost there, and what its owner should know: a cost above 1, angles that look like degrees, readings that
+never change or follow from others. What cannot be learned is one line, and the exit status 2.
+
+examples
+  pegasus-check task=gym env=robot:Arm-v0 cost=robot:cost angles=[0] start_mean=[3.14,0]
+  pegasus-check task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
 """
 
 EVALUATE = """\
@@ -111,6 +128,11 @@ def train() -> None:
     main(_train, TRAIN)
 
 
+def check() -> None:
+    """Entry point of pegasus-check."""
+    main(_check, CHECK, stopped="nothing was written")
+
+
 def evaluate() -> None:
     """Entry point of pegasus-eval."""
     main(_evaluate, EVALUATE)
@@ -131,16 +153,32 @@ def figures() -> None:
     main(_figures, FIGURES, stopped="finished variants are kept, the same command goes on")
 
 
-OPTIONS = ("out", "resume", "seeds", "mesh", "distributed", "coordinator", "processes", "process")  # of pegasus-train
+OPTIONS = (
+    "out",
+    "resume",
+    "final",
+    "seeds",
+    "mesh",
+    "distributed",
+    "coordinator",
+    "processes",
+    "process",
+)  # of pegasus-train
+
+_begun: list[Path] = []  # the folder of what this process learns, for whoever stops it
 
 
 def _train(words: Sequence[str]) -> None:
-    from pegasus_jax import record, restore, settings, tasks
+    from pegasus_jax import defaults, progress, record, settings
 
     options, rest = settings.split(words, OPTIONS)
     command = shlex.join(["pegasus-train", *words])
+    if empty := [name for name in ("out", "resume") if options.get(name) == ""]:
+        raise SettingError(f"{empty[0]}= names no folder; for example {empty[0]}=runs/demo")
     if "resume" in options:
-        if wrong := sorted(key for key in {*rest, *options} - {"resume", *OPTIONS[3:]} if not _changeable(key)):
+        if wrong := sorted(
+            key for key in {*rest, *options} - {"resume", "final", *OPTIONS[4:]} if not _changeable(key)
+        ):
             raise SettingError(
                 f"{wrong[0]} cannot be changed by resume=; only trials=, evaluation=, fit.*, search.* can, and mjcf= if"
                 " the file was moved"
@@ -149,28 +187,48 @@ def _train(words: Sequence[str]) -> None:
         runs = record.seeds_of(home)
         first = record.existing(next(iter(runs.values()), home))
         mjcf = rest.pop("mjcf", None)
-        config = restore.moved(first, settings.load(first / "config.yaml"), mjcf)
-        config = settings.override(config, settings.values(rest))
-        restore.announce(first, config)
+        config = settings.override(settings.load(first / "config.yaml"), settings.values(rest))
         runs = runs or {config.seed: home}
     else:
-        config = tasks.pinned(settings.parse(rest, options=OPTIONS))
+        config = settings.parse(rest, options=OPTIONS)
         seeds = range(config.seed, config.seed + whole("seeds", options.get("seeds", "1")))
         name = f"seed{seeds[0]}" if len(seeds) == 1 else f"seeds{seeds[0]}-{seeds[-1]}"
-        home = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{tasks.label(config)}-{name}"))
+        home = Path(options["out"]) if "out" in options else record.free(Path(f"runs/{defaults.label(config)}-{name}"))
         runs = {config.seed: home} if len(seeds) == 1 else {seed: home / f"seed{seed}" for seed in seeds}
-    if len(runs) > 1 and config.task == tasks.GYM:
+    if len(runs) > 1 and config.task == defaults.GYM:
         raise SettingError(f"seeds={len(runs)} is too many for task=gym, whose environment is one object; seeds=1")
+    if options.get("final", "false") not in ("true", "false"):
+        raise SettingError(f"final={options['final']} is neither true nor false")
+    done = len(record.readable_trials(first)[0]) if "resume" in options else None
+    _begun.append(home)
+    print(progress.announcement(config, home, len(runs), done), flush=True)
     _join(options)
     from pegasus_jax.program import leads, share_processors
 
+    # Before any of the user's code, which may use JAX as soon as it is imported.
     if not {"mesh", "distributed", "coordinator"} & {*options}:
         search = config.search
         share_processors(len(runs), search.particles * search.starts if isinstance(search, Search) else None)
     over = _mesh(options.get("mesh"), len(runs))
+    if leads():
+        print(progress.devices(), flush=True)
+    from pegasus_jax.tasks import pinned
+
+    if "resume" in options:
+        from pegasus_jax import restore
+
+        config = restore.moved(first, config, mjcf)
+        restore.announce(first, config)
+    else:
+        config = pinned(config)
     from pegasus_jax.build import build
 
-    build(replace(config, seed=0), over)  # so that impossible settings end here, before anything is written
+    task = build(replace(config, seed=0), over).task  # so that impossible settings end here, before anything is written
+    if "resume" not in options:
+        from pegasus_jax import check
+
+        for note in check.before_training(config, task, 1 if "start_mean" in rest else check.RESETS):
+            print(f"note: {note}", file=sys.stderr)
     if "resume" not in options and leads():
         if record.seeds_of(home):
             raise SettingError(f"out={home} holds runs already; resume={home} goes on, out={record.free(home)} is free")
@@ -178,9 +236,27 @@ def _train(words: Sequence[str]) -> None:
             record.create(run)
     from pegasus_jax.train import train_seeds
 
-    train_seeds(config, runs, resume="resume" in options, command=command, mesh=over)
+    final = options.get("final") == "true"
+    train_seeds(config, runs, resume="resume" in options, command=command, final=final, mesh=over)
     if leads():
+        from pegasus_jax import restore
+
+        for seed, run in runs.items():
+            told = progress.best_line(record.trials(run), restore.best(run))
+            print(f"seed {seed}: {told}" if len(runs) > 1 else told)
         print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(runs.values()))})")
+
+
+def _check(words: Sequence[str]) -> None:
+    from pegasus_jax import settings
+
+    options, rest = settings.split(words, OPTIONS)
+    if "resume" in options:
+        raise SettingError(f"resume={options['resume']} was checked when it began; give the words of a new run")
+    config = settings.parse(rest, options=OPTIONS)
+    from pegasus_jax.check import report
+
+    print("\n".join(report(config)))
 
 
 def _changeable(key: str) -> bool:
@@ -315,6 +391,7 @@ def whole(name: str, text: str) -> int:
     """The whole number of an option. Raises SettingError when it is none, or 0 where nothing would be done."""
     if not text.isdecimal() or (name in ("episodes", "seeds", "jobs") and int(text) < 1):
         raise SettingError(f"{name}={text} is not a whole number; for example {name}=20")
+    within(name, int(text), 0, 2**32 - 1 if name == "seed" else SIZES["trials"])
     return int(text)
 
 
@@ -335,7 +412,7 @@ def _help(text: str, words: Sequence[str]) -> str:
     if "{settings}" not in text:
         return text
     from pegasus_jax import settings
-    from pegasus_jax.tasks import NAMES
+    from pegasus_jax.defaults import NAMES
     from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 
     named = dict(tasks=NAMES, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
@@ -356,40 +433,89 @@ def _help(text: str, words: Sequence[str]) -> str:
 def main(
     command: Callable[[Sequence[str]], None],
     text: str,
-    stopped: str = "every finished episode is kept, resume=RUN goes on",
+    stopped: str = "nothing was learned",
 ) -> None:
-    """Run a command: 0 done, 1 stopped by its user, 2 a setting or a run's folder that cannot be, in one line."""
+    """Run a command: 0 done, 2 a setting or a run's folder that cannot be, in one line, 130 after Ctrl-C.
+
+    Whatever ends it, a robot is let go first, and no thread that still compiles is waited for.
+    """
     words = sys.argv[1:]
+    interrupt.before_end(_let_robots_go)
+    try:
+        interrupt.listen()
+        code = _code(command, words, text)
+    except KeyboardInterrupt:
+        interrupt.clean_up()
+        print(_stopped(_begun[0]) if _begun else f"stopped; {stopped}", file=sys.stderr)
+        code = interrupt.status()
+    except BaseException:
+        interrupt.clean_up()
+        raise
+    interrupt.clean_up()
+    interrupt.end(code)
+
+
+def _stopped(home: Path) -> str:
+    from pegasus_jax.progress import stopped
+
+    return stopped(home)
+
+
+def _let_robots_go() -> None:
+    """Close every environment that is open."""
+    if "pegasus_jax.tasks" in sys.modules:  # else none can be
+        from pegasus_jax.tasks import close_environments
+
+        close_environments()
+
+
+def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: str) -> int:
+    """The exit status of a command that nobody stopped."""
     from pegasus_jax.checks import RunError
 
     try:
+        words = [*words, *(_always() if words and command in (_train, _figures) else ())]
         if not words or HELP & {*words}:
             print(_help(text, words), end="")
-            sys.exit(0 if words else 2)
+            return 0 if words else 2
         _remember_compilations()
         command(words)
     except (SettingError, RunError) as error:
+        interrupt.clean_up()
         print(f"pegasus: {error}", file=sys.stderr)
-        sys.exit(2)
+        return 2
     except OSError as error:
-        print(f"pegasus: {files.refused(error)}; {stopped}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print(f"stopped; {stopped}", file=sys.stderr)
-        sys.exit(1)
+        interrupt.clean_up()
+        print(f"pegasus: {files.refused(error)}{_goes_on()}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _goes_on() -> str:
+    """How to go on with what was begun."""
+    return f"; every finished episode is kept, resume={_begun[0]} goes on" if _begun else ""
+
+
+def _always() -> list[str]:
+    """The words of PEGASUS_SETTINGS, which come after those that were typed."""
+    text = os.environ.get("PEGASUS_SETTINGS", "")
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise SettingError(f"PEGASUS_SETTINGS={text} cannot be read: {error}; expected key=value words") from error
 
 
 def _remember_compilations() -> None:
-    """Keep compiled programs in the user's cache folder, unless JAX was told where already; in none that is unsafe."""
-    import jax
+    """Keep compiled programs in the user's cache folder, unless JAX, which is not imported yet, is told where.
 
-    told = "JAX_COMPILATION_CACHE_DIR" in os.environ
-    folder = os.environ["JAX_COMPILATION_CACHE_DIR"] if told else cache.folder()
+    In none that is unsafe.
+    """
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR", cache.folder())
     if not folder or "://" in folder:
         return
     if problem := cache.problem(Path(folder)):
         print(f"{folder} {problem}; programs are compiled as if for the first time", file=sys.stderr)
-        jax.config.update("jax_compilation_cache_dir", None)
-    elif not told:
-        jax.config.update("jax_compilation_cache_dir", folder)
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+        os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
+    elif "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")

@@ -4,23 +4,15 @@ Values are checked when a config is made; a bad one raises `SettingError`, which
 """
 
 import dataclasses
-import math
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 from pegasus_jax import checks
 from pegasus_jax.checks import SettingError
+from pegasus_jax.config_models import BNN, GP, INITIALISERS, SSGP, Lagrangian, setting
 
+GYM, MJCF = ("gym",), ("mjcf",)
+OWN = (*GYM, *MJCF)
 
-def setting(default: Any, text: str) -> Any:
-    """A field with its help text."""
-    return field(default=default, metadata={"help": text})
-
-
-DROPOUTS = ("log_normal", "binary", "concrete", "gaussian", "sparse", "none")
-HEADS = ("sigmoid", "softplus")
-ACTIVATIONS = ("relu", "silu", "tanh")
-INITIALISERS = ("glorot", "orthogonal")
 SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
 AGGREGATES = ("mean", "total")
@@ -29,90 +21,7 @@ SENSORS = ("predicted", "known")
 EXECUTIONS = ("sampled", "mean")
 LEGS = (2, 6)
 PRECISIONS = ("single", "double")
-
-
-@dataclass(frozen=True)
-class _Network:
-    """What every network model has, and an ensemble of them."""
-
-    kind: str = setting("", "")
-    members: int = setting(1, "networks fitted side by side; each particle follows one of them")
-    hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
-    dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
-    rate: float = setting(0.1, "drop probability of binary dropout, initial one of concrete dropout")
-    low: float = setting(-10.0, "lower end of the interval of log z (log_normal)")
-    high: float = setting(0.0, "upper end of the interval of log z (log_normal)")
-    head: str = setting("sigmoid", "form of the predicted noise: sigmoid (at most .1 of the target's scale), softplus")
-    kl_weight: float = setting(0.1, "factor of the noise's KL divergence; 1 is the variational bound")
-    weight_decay: float = setting(1.0, "factor of the Gaussian prior on the weights")
-    activation: str = setting("silu", "nonlinearity: relu, silu, tanh")
-    initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
-
-    def __post_init__(self) -> None:
-        checks.kind("model", self.kind, type(self).kind)
-        checks.within("model.members", self.members, 1)
-        object.__setattr__(self, "hidden", checks.layers("model.hidden", self.hidden))
-        kinds = dict(activation=ACTIVATIONS, dropout=DROPOUTS, head=HEADS, initialiser=INITIALISERS)
-        for name, choices in kinds.items():
-            checks.choice(f"model.{name}", getattr(self, name), choices)
-        checks.within("model.rate", self.rate, 0, 0.99)
-        checks.least("model", self, 0, "kl_weight", "weight_decay")
-        checks.least("model", self, -math.inf, "low", "high")
-        if not self.low < self.high:
-            raise SettingError(f"model.low={self.low:g} must be less than model.high={self.high:g}")
-
-
-@dataclass(frozen=True)
-class BNN(_Network):
-    """Bayesian neural network dynamics, or an ensemble of them."""
-
-    kind: str = setting("bnn", "")
-    input_noise: bool = setting(False, "noise on the network's own inputs as well")
-    heteroscedastic: bool = setting(True, "predicted noise depends on the input")
-    whitening: str = setting("full", "scaling of inputs and targets: full covariance, or diagonal")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.choice("model.whitening", self.whitening, ("full", "diagonal"))
-
-
-@dataclass(frozen=True)
-class Lagrangian(_Network):
-    """Dynamics of a mechanism whose energies are a Bayesian neural network, or an ensemble of them."""
-
-    kind: str = setting("lagrangian", "")
-    hidden: tuple[int, ...] = setting((32, 32), "widths of the hidden layers")
-    substeps: int = setting(2, "Runge-Kutta steps a control period")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        checks.within("model.substeps", self.substeps, 1)
-
-
-@dataclass(frozen=True)
-class GP:
-    """Exact Gaussian-process dynamics."""
-
-    kind: str = setting("gp", "")
-    features: int = setting(200, "sines and cosines in a particle's function, before the data correct it")
-
-    def __post_init__(self) -> None:
-        checks.kind("model", self.kind, "gp")
-        checks.within("model.features", self.features, 2)
-        if self.features % 2:
-            raise SettingError(f"model.features={self.features} must be even; the nearest is {self.features + 1}")
-
-
-@dataclass(frozen=True)
-class SSGP:
-    """Sparse-spectrum Gaussian-process dynamics."""
-
-    kind: str = setting("ssgp", "")
-    points: int = setting(100, "frequencies of each dimension, a cosine and a sine each")
-
-    def __post_init__(self) -> None:
-        checks.kind("model", self.kind, "ssgp")
-        checks.within("model.points", self.points, 1)
+SUCCESSORS = ("always", "better")
 
 
 @dataclass(frozen=True)
@@ -124,17 +33,19 @@ class MLP:
     dropout: float = setting(0.0, "drop probability of the hidden units; 0 is a deterministic policy")
     squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
     execution: str = setting("sampled", "on the plant: sampled (a fresh mask each step, explores), or mean")
-    input_units: tuple[float, ...] = setting((), "what it counts each state that is no angle in; []: the plant's units")
+    input_units: tuple[float, ...] = setting(
+        (), "unit of each state that is not an angle, one number each; []: the plant's units"
+    )
     output_scale: float = setting(1.0, "factor of the last layer's initial weights")
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
+        checks.typed("policy", self)
         checks.kind("policy", self.kind, "mlp")
-        object.__setattr__(self, "hidden", checks.layers("policy.hidden", self.hidden))
+        checks.layers("policy.hidden", self.hidden)
         for name, choices in (("squash", SQUASHES), ("execution", EXECUTIONS), ("initialiser", INITIALISERS)):
             checks.choice(f"policy.{name}", getattr(self, name), choices)
         checks.within("policy.dropout", self.dropout, 0, 0.99)
-        object.__setattr__(self, "input_units", tuple(self.input_units))
         for name, value in (("output_scale", self.output_scale), *(("input_units", unit) for unit in self.input_units)):
             checks.within(f"policy.{name}", value, 0, open_low=True)
 
@@ -149,8 +60,9 @@ class RBF:
     execution = "mean"  # no setting: there is nothing to sample
 
     def __post_init__(self) -> None:
+        checks.typed("policy", self)
         checks.kind("policy", self.kind, "rbf")
-        checks.within("policy.units", self.units, 1)
+        checks.size("policy.units", self.units)
         checks.choice("policy.squash", self.squash, SQUASHES)
 
 
@@ -163,6 +75,7 @@ class Linear:
     execution = "mean"  # no setting: there is nothing to sample
 
     def __post_init__(self) -> None:
+        checks.typed("policy", self)
         checks.kind("policy", self.kind, "linear")
         checks.choice("policy.squash", self.squash, SQUASHES)
 
@@ -179,9 +92,9 @@ class Fit:
     reset: bool = setting(False, "forget Adam's moments at each trial")
 
     def __post_init__(self) -> None:
+        checks.typed("fit", self)
         checks.kind("fit", self.kind, "adam")
-        checks.within("fit.steps", self.steps, 1)
-        checks.within("fit.batch", self.batch, 1)
+        checks.sizes("fit", self, "steps", "batch")
         checks.within("fit.learning_rate", self.learning_rate, 0, open_low=True)
         checks.within("fit.decay", self.decay, 0, 1)
 
@@ -195,9 +108,9 @@ class LBFGS:
     starts: int = setting(100, "fresh parameters, of which the best, or the current ones, begin")
 
     def __post_init__(self) -> None:
+        checks.typed("fit", self)
         checks.kind("fit", self.kind, "lbfgs")
-        checks.within("fit.steps", self.steps, 1)
-        checks.within("fit.starts", self.starts, 1)
+        checks.sizes("fit", self, "steps", "starts")
 
 
 @dataclass(frozen=True)
@@ -211,6 +124,7 @@ class Period:
     match: int = setting(1, "noise of the moment matching")
 
     def __post_init__(self) -> None:
+        checks.typed("search.period", self)
         for f in dataclasses.fields(self):
             checks.within(f"search.period.{f.name}", getattr(self, f.name), 0)
 
@@ -229,39 +143,47 @@ class Search:
     balanced: bool = setting(False, "make the drawn noise exactly zero mean, unit covariance over the particles")
     aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
     discount: float = setting(1.0, "weight of a later step against the one before")
-    cost: str = setting("matched", "expected one of the matched Gaussian, or of each of the particles: particles")
+    cost: str = setting(
+        "matched", "matched: expected cost of the matched Gaussian; particles: mean cost of the particles"
+    )
     refine: float = setting(
-        0.0, "last part of a search: refines what it found or the old policy, and ends with the best it had"
+        0.0, "last part of a search, as a fraction, which refines the better of the new policy and the old one"
     )
     widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
-    anneal: int = setting(1, "so many trials' searches are one to widen and decay, which end then; 1: each is its own")
+    anneal: int = setting(1, "trials over which widen= and decay= run down once; 1: in every search")
     risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
     truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
-    limit: float | None = setting(None, "a particle's gradient by its state that is longer is dropped; null: none is")
+    limit: float | None = setting(
+        None, "drop a particle's gradient with respect to its state where it is longer; null: never"
+    )
     reheat: float = setting(
-        0.0, "step size each search after `anneal` starts from and falls, as a fraction; 0: it stays"
+        0.0, "after `anneal` trials: step size at the start of each search, as a fraction; 0: constant"
     )
     loosen: float = setting(1.0, "factor of the limit in the searches that are reheated")
     best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(
-        True, "start a search from a fresh policy where that costs less than the old one, or the last search was stale"
+        True, "start from a fresh policy if it costs less than the old one, or the last search found nothing better"
     )
     anew: bool = setting(
         False, "start every search from a fresh policy; the old one is refined if none better is found"
     )
     starts: int = setting(1, "policies searched side by side, the best of which goes on: the old one and fresh ones")
-    sensors: str = setting("predicted", "noise on what the policy sees: as the model predicts, or the plant's: known")
+    sensors: str = setting(
+        "predicted", "noise on what the policy sees: predicted (by the model) or known (the plant's)"
+    )
     policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
     cost_noise: float = setting(0.0, "factor of the predicted noise on what the cost sees")
     period: Period = Period()
 
     def __post_init__(self) -> None:
+        checks.typed("search", self)
         checks.kind("search", self.kind, "particles")
         checks.least("search", self, 0, "policy_noise", "state_noise", "cost_noise")
-        checks.least("search", self, 1, "steps", "widen", "anneal", "starts", "loosen")
-        checks.least("search", self, 2, "particles")
+        checks.least("search", self, 1, "widen", "loosen")
+        checks.sizes("search", self, "steps", "anneal", "starts")
+        checks.sizes("search", self, "particles", low=2)
         checks.within("search.learning_rate", self.learning_rate, 0, open_low=True)
         checks.within("search.decay", self.decay, 0, 1)
         checks.within("search.reheat", self.reheat, 0, 1)
@@ -310,10 +232,11 @@ class Analytic:
     reset, anneal, sensors = True, 1, "predicted"  # no settings: curvature is that of one model
 
     def __post_init__(self) -> None:
+        checks.typed("search", self)
         checks.kind("search", self.kind, "analytic")
         checks.least("search", self, 0, "policy_noise", "state_noise", "cost_noise")
-        checks.least("search", self, 1, "steps")
-        checks.least("search", self, 2, "particles")
+        checks.sizes("search", self, "steps")
+        checks.sizes("search", self, "particles", low=2)
         checks.choice("search.aggregate", self.aggregate, AGGREGATES)
         checks.within("search.discount", self.discount, 0, 1, open_low=True)
 
@@ -326,7 +249,8 @@ class Explore:
     kind: str = setting("uniform", "uniform: a fresh control each step; walk: a random walk")
 
     def __post_init__(self) -> None:
-        checks.within("explore.trials", self.trials, 0)
+        checks.typed("explore", self)
+        checks.size("explore.trials", self.trials, 0)
         checks.choice("explore.kind", self.kind, EXPLORATIONS)
 
 
@@ -338,50 +262,62 @@ class Config:
     """One run."""
 
     task: str = setting("cartpole", "what to learn")
-    legs: int = setting(2, "that a swimmer drives: 2 or 6; the other tasks have none")
-    env: str | None = setting(None, "of task=gym: the environment's Gymnasium id")
-    mjcf: str | None = setting(None, "of task=mjcf: the MuJoCo file, path/to/model.xml")
-    cost: str | None = setting(None, "of task=gym|mjcf: module:function, observation [D] -> cost in [0, 1], in JAX")
-    angles: tuple[int, ...] = setting((), "of task=gym|mjcf: the entries of the observation that are angles [rad]")
-    rates: tuple[int, ...] = setting((), "of task=gym: the entries that are the other entries' rates, in their order")
-    horizon: int | None = setting(None, "of task=gym|mjcf: control periods an episode; null: a gym's own limit, or 100")
+    legs: int = setting(2, "that the swimmer drives: 2 or 6", ("swimmer_*",))
+    env: str | None = setting(None, "the environment's Gymnasium id", GYM)
+    mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", MJCF)
+    cost: str | None = setting(None, "module:function, observation [D] -> cost in [0, 1], in JAX", OWN)
+    angles: tuple[int, ...] = setting((), "the entries of the observation that are angles [rad]", OWN)
+    rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", GYM)
+    horizon: int | None = setting(None, "control periods an episode; null: a gym's own limit, or 100", OWN)
     dt: float | None = setting(
-        None, "of task=gym|mjcf: control period [s]; null: a gym's own. A whole number of an mjcf's time steps"
+        None, "control period [s]; null: a gym's own. A whole number of an mjcf's time steps", OWN
     )
-    observe: tuple[str, ...] = setting((), "of task=mjcf: as [qpos.0,qvel.1]; []: all positions, then all velocities")
-    control_low: tuple[float, ...] = setting(
-        (), "of task=gym|mjcf: least controls; []: the action space's, the file's ctrlrange"
+    env_args: tuple[str, ...] = setting((), "the environment's own arguments, each as env_args.port=/dev/ttyACM0", GYM)
+    stop: str | None = setting(
+        None, "module:function, observation [D] -> probability that an episode ends there, in JAX", OWN
     )
+    stop_cost: float = setting(1.0, "of each control period that an early end leaves out", OWN)
+    observe: tuple[str, ...] = setting((), "as [qpos.0,qvel.1]; []: all positions, then all velocities", MJCF)
+    control_low: tuple[float, ...] = setting((), "least controls; []: the action space's, the file's ctrlrange", OWN)
     control_high: tuple[float, ...] = setting(
-        (), "of task=gym|mjcf: greatest controls; []: the action space's, the file's ctrlrange"
+        (), "greatest controls; []: the action space's, the file's ctrlrange", OWN
     )
-    start_mean: tuple[float, ...] = setting(
-        (), "of task=gym|mjcf: of the observation; []: of 100 resets, the file's pose at rest"
-    )
+    start_mean: tuple[float, ...] = setting((), "of the observation; []: of 100 resets, the file's pose at rest", OWN)
     start_std: tuple[float, ...] = setting(
-        (0.1,), "of task=gym|mjcf: spread of the starts around start_mean, one for all or one each"
+        (0.1,), "spread of the starts around start_mean, one for all or one each", OWN
     )
+    success: float = setting(0.2, "the mean cost of an episode's last five steps is less than this", OWN)
     seed: int = setting(0, "all randomness of the run comes from it")
     trials: int = setting(15, "episodes on the plant, the random ones included")
     evaluation: int = setting(20, "episodes after each trial that only measure the policy; 0: none, as for a robot")
+    successor: str = setting(
+        "always", "which policy runs next: always the new one, or the better one as expected under the new model"
+    )
     precision: str = setting("single", "of all numbers: single (32 bits) or double (64)")
-    model: Model = BNN()
+    model: Model = BNN()  # noqa: RUF009 (frozen)
     policy: MLP | RBF | Linear = MLP()
     fit: Fit | LBFGS = Fit()
     search: Search | Analytic = Search()
     explore: Explore = Explore()
 
     def __post_init__(self) -> None:
+        checks.typed("", self)
         checks.choice("legs", self.legs, LEGS)
         checks.choice("precision", self.precision, PRECISIONS)
-        for name in ("angles", "rates", "observe", "control_low", "control_high", "start_mean", "start_std"):
-            object.__setattr__(self, name, tuple(getattr(self, name)))
+        checks.choice("successor", self.successor, SUCCESSORS)
+        checks.within("stop_cost", self.stop_cost, 0)
+        for name in ("env_args", "angles", "rates", "observe"):
+            checks.different(name, getattr(self, name))
+        for name in ("control_low", "control_high", "start_mean"):
+            checks.finite(name, getattr(self, name))
         for deviation in self.start_std:
             checks.within("start_std", deviation, 0)
+        checks.within("success", self.success, 0, open_low=True)
         if self.dt is not None:
-            checks.within("dt", self.dt, 0, open_low=True)
+            checks.within("dt", self.dt, 0, checks.SIZES["dt"], open_low=True)
         if self.horizon is not None:
-            checks.within("horizon", self.horizon, 1)
+            checks.size("horizon", self.horizon)
         checks.within("seed", self.seed, 0, 2**32 - 1)
-        checks.within("trials", self.trials, 1, 10_000)
-        checks.within("evaluation", self.evaluation, 0)
+        checks.sizes("", self, "trials")
+        checks.sizes("", self, "evaluation", low=0)
+        checks.rows(self.trials, self.horizon)

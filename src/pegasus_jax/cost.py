@@ -95,6 +95,17 @@ def of_particles(cost: Cost) -> Callable[[Array], Array]:
     return jax.vmap(jax.vmap(cost))
 
 
+def until_stop(costs: Array, x: Array, stop: Callable[[Array], Array], stop_cost: float) -> Array:
+    """Costs [H, K] or [H, 1] of particles x [H, K, D] that end where `stop` says; after that a step costs `stop_cost`.
+
+    A particle goes on after each state with probability 1 - stop(x); the state that ends it still has its own cost.
+    """
+    goes_on = jnp.cumprod(1 - jax.vmap(jax.vmap(stop))(x).astype(costs.dtype), 0)
+    running = jnp.concatenate([jnp.ones_like(goes_on[:1]), goes_on[:-1]])
+    running = running if costs.shape[1] == running.shape[1] else jnp.mean(running, 1, keepdims=True)
+    return running * costs + (1 - running) * stop_cost
+
+
 def of_matched(expected: Expected) -> Callable[[Array], Array]:
     """The expected cost of the Gaussian with the particles' mean and covariance: x [H, K, D] -> [H, 1]."""
     return jax.vmap(lambda x: expected(*mean_and_cov(x))[None])

@@ -14,18 +14,19 @@ def empty(capacity: int, states: int, controls: int) -> Dataset:
 
 
 def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...]) -> Dataset:
-    """The data set with the H transitions of an episode behind it (Alg. 1 line 4).
+    """The data set with the transitions of an episode behind it (Alg. 1 line 4).
 
-    A full data set forgets nothing silently: the caller sizes it for the whole run (trials x horizon).
+    Of an episode that ended early only the rows that took place. Rows for which there is no room are left out, and what
+    is there stays: the caller sizes a data set for the whole run (trials x horizon).
     """
+    horizon, capacity = trajectory.u.shape[0], data.x.shape[0]
+    length = horizon if trajectory.length is None else trajectory.length
+    rows = jnp.arange(horizon)
+    place = jnp.where(rows < length, data.size + rows, capacity)  # beyond the end: dropped
     y = difference(trajectory.x[1:], trajectory.x[:-1], angles)
-    put = jax.lax.dynamic_update_slice_in_dim
-    return Dataset(
-        put(data.x, trajectory.x[:-1], data.size, 0),
-        put(data.u, trajectory.u, data.size, 0),
-        put(data.y, y, data.size, 0),
-        data.size + y.shape[0],
-    )
+    new = trajectory.x[:-1], trajectory.u, y
+    x, u, y = (old.at[place].set(rows, mode="drop") for old, rows in zip(data[:3], new, strict=True))
+    return Dataset(x, u, y, jnp.minimum(data.size + length, capacity).astype(jnp.int32))
 
 
 def grow(data: Dataset, capacity: int) -> Dataset:

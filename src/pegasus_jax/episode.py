@@ -1,18 +1,23 @@
-"""One episode of a controller on a simulated plant."""
+"""One episode of a controller: on a plant in JAX, as one pure function, or on an environment, step by step."""
 
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from pegasus_jax.types import Array, Key, Task, Trajectory
+from pegasus_jax import interrupt
+from pegasus_jax.types import Array, Episode, Key, Task, Trajectory
+
+CUT = ("error", "interrupted")  # how an episode can end by no doing of its policy
 
 
 def run(key: Key, act: Callable[[Key, Array, Array], Array], task: Task) -> Trajectory:
     """H control periods of act(key, t, x [D]) -> u [U] on the task's plant, from a random start.
 
-    The controller and the data see the state with sensor noise; the cost is of the true state.
+    The controller and the data see the state with sensor noise; the cost is of the true state. Where the task's `stop`
+    says so it is over: the periods after that are no data, and cost `stop_cost`.
     """
     return watch(key, act, task, lambda state, u: ())[0]
 
@@ -21,7 +26,8 @@ def watch(
     key: Key, act: Callable[[Key, Array, Array], Array], task: Task, look: Callable[[Any, Array], Any]
 ) -> tuple[Trajectory, Any]:
     """`run`, and what `look(plant's state, u [U])` returned at the beginning of each control period [H, ...]."""
-    assert task.plant is not None, f"task {task.name} has no simulated plant"
+    if task.plant is None:
+        raise ValueError(f"task {task.name} has no plant in JAX; hand its episodes to absorb")
     plant = task.plant
     begin, first, steps = jax.random.split(key, 3)
     sensor_std = jnp.asarray(task.sensor_std, float)
@@ -30,7 +36,7 @@ def watch(
         x = plant.observe(state)
         return x + sensor_std * jax.random.normal(key, x.shape)
 
-    def step(carry: tuple, t_and_key: tuple[Array, Key]) -> tuple[tuple, tuple[Array, Array, Array, Any]]:
+    def step(carry: tuple, t_and_key: tuple[Array, Key]) -> tuple[tuple, tuple[Array, Array, Array, Array, Any]]:
         state, x = carry
         t, key = t_and_key
         act_key, sensor_key = jax.random.split(key)
@@ -38,13 +44,95 @@ def watch(
         looked = look(state, u)
         state = plant.step(state, u)
         after = measure(sensor_key, state)
-        return (state, after), (after, u, task.cost(plant.observe(state)), looked)
+        seen = plant.observe(state)
+        over = jnp.zeros((), bool) if task.stop is None else task.stop(seen) > 0.5
+        return (state, after), (after, u, task.cost(seen), over, looked)
 
     state = plant.reset(begin)
     x = measure(first, state)
     times = jnp.arange(task.horizon)
-    _, (xs, us, costs, looks) = jax.lax.scan(step, (state, x), (times, jax.random.split(steps, task.horizon)))
-    return Trajectory(jnp.concatenate([x[None], xs]), us, costs), looks
+    _, (xs, us, costs, over, looks) = jax.lax.scan(step, (state, x), (times, jax.random.split(steps, task.horizon)))
+    xs = jnp.concatenate([x[None], xs])
+    if task.stop is None:
+        return Trajectory(xs, us, costs), looks
+    length = jnp.where(jnp.any(over), jnp.argmax(over) + 1, task.horizon).astype(jnp.int32)
+    return Trajectory(xs, us, jnp.where(times < length, costs, task.stop_cost), length), looks
+
+
+def drive(seed: int, act: Callable[[int, np.ndarray], Any], task: Task) -> Episode:
+    """At most H control periods of act(t, x [D]) -> u [U] on the task's environment; its rows are NumPy's, of NaN cost.
+
+    `terminated` and `truncated` end it, and so does what the environment raises, an observation that is not finite, and
+    a signal: then `error` says what, the rows so far are kept, and the environment is closed before this returns. A
+    request to stop is looked at before every control. Rows hold the controls as they were sent.
+    """
+    rows, ended, error, first = [], "horizon", None, None
+    try:
+        interrupt.forget_input()
+        interrupt.check()
+        first = x = task.environment.reset(seed)
+        interrupt.reclaim()
+        for t in range(task.horizon):
+            u = act(t, x)
+            interrupt.check()
+            x, sent, over = task.environment.step(u)
+            rows.append((x, sent))
+            if over:
+                ended = over
+                break
+    except BaseException as raised:
+        interrupt.let_go(task.environment.close)
+        ended, error = "interrupted" if isinstance(raised, KeyboardInterrupt) else "error", raised
+    states, controls = len(task.state_names), len(task.control_names)
+    x = np.array([*([] if first is None else [first]), *(x for x, _ in rows)], np.float32).reshape(-1, states)
+    u = np.array([u for _, u in rows], np.float32).reshape(-1, controls)
+    return Episode(Trajectory(x, u, np.full(len(u), np.nan, np.float32)), ended, error)  # type: ignore[arg-type]
+
+
+def padded(trajectory: Trajectory, horizon: int) -> Trajectory:
+    """The episode of L <= H control periods in arrays of H, with its length: nothing recompiles for another L."""
+    length = len(trajectory.cost)
+
+    def pad(rows: Any, size: int) -> Array:
+        rows = jnp.asarray(rows)
+        return jnp.pad(rows, [(0, size - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
+
+    x, u, cost = pad(trajectory.x, horizon + 1), pad(trajectory.u, horizon), pad(trajectory.cost, horizon)
+    return Trajectory(x, u, cost, jnp.int32(length))
+
+
+def trimmed(trajectory: Trajectory) -> Trajectory:
+    """The rows that took place, without a length: what is stored, and drawn."""
+    length = len(trajectory.u) if trajectory.length is None else int(trajectory.length)
+    return Trajectory(trajectory.x[: length + 1], trajectory.u[:length], trajectory.cost[:length])
+
+
+def charged(cost: Any, task: Task) -> np.ndarray:
+    """The costs [H] of an episode of L periods: each of those that an early end left out costs `task.stop_cost`."""
+    cost = np.asarray(cost, np.float64)
+    return np.concatenate([cost, np.full(task.horizon - len(cost), task.stop_cost)])
+
+
+def mean_cost(ran: Episode, task: Task) -> float:
+    """Mean cost a step of an episode; of one that a fault or a person cut short, of the steps that there were.
+
+    The same number for an episode that was just run and for one that was read back.
+    """
+    cost = np.asarray(ran.trajectory.cost, np.float64)
+    return float(np.mean(cost if ran.ended in CUT else charged(cost, task)))
+
+
+def succeeded(costs: Any, task: Task) -> np.ndarray:
+    """Which episodes [...] of costs [..., H] succeeded: their last five steps cost little on average."""
+    return np.mean(np.asarray(costs)[..., -5:], axis=-1) < task.success
+
+
+def verdict(ran: Episode, task: Task) -> dict[str, Any]:
+    """What an episode says of its policy: its mean cost a step, and whether it succeeded."""
+    return {
+        "episode_cost": mean_cost(ran, task),
+        "episode_success": bool(succeeded(charged(ran.trajectory.cost, task), task)),
+    }
 
 
 def uniform(key: Key, low: Array, high: Array, horizon: int) -> Array:

@@ -3,19 +3,23 @@
 They lie in a run's folder, so that whoever looks at the run needs neither a robot nor the files of its user.
 """
 
+from __future__ import annotations
+
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pegasus_jax.checks import RunError
-from pegasus_jax.types import Task
+
+if TYPE_CHECKING:
+    from pegasus_jax.types import Task
 
 TEXTS = ("state_names", "control_names")
 ENTRIES = ("angles", "rates")  # of the state
 STATE = ("start_mean", "start_std", "sensor_std")  # one number a state
 CONTROL = ("control_low", "control_high")  # one number a control
-NUMBERS = ("dt", "success")
+NUMBERS = ("dt", "success", "stop_cost")
 
 
 def of_task(task: Task) -> dict[str, Any]:
@@ -30,7 +34,6 @@ def of_task(task: Task) -> dict[str, Any]:
         **{name: [int(entry) for entry in getattr(task, name)] for name in ENTRIES},
         **{name: np.asarray(getattr(task, name), float).tolist() for name in (*STATE, *CONTROL)},
         **{name: float(getattr(task, name)) for name in NUMBERS},
-        "stop_cost": float(getattr(task, "stop_cost", 1.0)),
         **({} if digest is None else {"mjcf_digest": digest}),
     }
 
@@ -48,10 +51,10 @@ def to_task(found: Any, where: str) -> Task:
             **{name: _numbers(found[name], controls) for name in CONTROL},
             **{name: float(_numbers([found[name]], 1)[0]) for name in NUMBERS},
         }
-        if "stop_cost" in Task._fields:
-            known["stop_cost"] = float(_numbers([found["stop_cost"]], 1)[0])
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{where} is damaged: its task has no usable {str(error) or 'facts'}") from error
+    from pegasus_jax.types import Task
+
     return Task(plant=None, cost=unknown_cost, widened=lambda _: (unknown_cost, unknown_cost), **known)
 
 

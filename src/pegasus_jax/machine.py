@@ -8,8 +8,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-import jax
-
 
 def processors() -> int:
     """How many processors this process may use."""
@@ -18,6 +16,8 @@ def processors() -> int:
 
 def about(command: str) -> dict[str, Any]:
     """Versions, machine and command: what somebody else needs to repeat the run."""
+    import jax
+
     packages = ("pegasus-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
     versions = {}
     for name in packages:

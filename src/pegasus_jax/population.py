@@ -12,15 +12,15 @@ FRESH = 2**31 - 1  # what a search's key is folded with for fresh policies; for 
 
 
 def best_of(
-    searcher: Searcher, fresh: Callable[[Key], Params], *, starts: int, window: int, lasting: bool = False
+    searcher: Searcher, fresh: Callable[[Key, Params], Params], *, starts: int, window: int, lasting: bool = False
 ) -> Searcher:
     """The searcher that searches from `starts` policies under the same scenarios, all of them until the trial ends.
 
-    The first is the policy it is given, the others are `fresh` at iteration 0 of each trial; or of the first search
-    where they are `lasting`, and then each goes on from trial to trial, whichever is the best. All begin a trial with a
-    new optimiser, and none has a rival. The learner's parameters are always those of the member with the lowest
-    mean objective over the last `window` iterations, or as many as there were. Its optimiser is all members: a
-    `Learner` [starts, ...].
+    The first is the policy it is given, the others are `fresh` (key, given policy) at iteration 0 of each trial; or of
+    the first search where they are `lasting`, and then each goes on from trial to trial, whichever is the best. All
+    begin a trial with a new optimiser, and none has a rival. The learner's parameters are always those of the member
+    with the lowest mean objective over the last `window` iterations, or as many as there were. Its optimiser is all
+    members: a `Learner` [starts, ...].
     """
 
     def init(params: Params) -> Learner:
@@ -41,7 +41,8 @@ def best_of(
         del rival, reset
 
         def gathered() -> Params:
-            others = jax.vmap(fresh)(jax.random.split(jax.random.fold_in(key, FRESH), starts - 1))
+            keys = jax.random.split(jax.random.fold_in(key, FRESH), starts - 1)
+            others = jax.vmap(fresh, (0, None))(keys, learner.params)
             return jax.tree.map(lambda own, rest: jnp.concatenate([own[None], rest]), learner.params, others)
 
         def begun() -> Learner:

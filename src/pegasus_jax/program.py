@@ -3,9 +3,11 @@
 import os
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, nullcontext
 from functools import cache, partial
 from importlib.metadata import entry_points
+from threading import Thread
 from typing import Any
 
 import jax
@@ -14,9 +16,10 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
-from pegasus_jax import mesh
+from pegasus_jax import interrupt, mesh
+from pegasus_jax.episode import trimmed
 from pegasus_jax.machine import processors
-from pegasus_jax.types import Experiment
+from pegasus_jax.types import Episode, Experiment, Params, Trajectory
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 
@@ -50,12 +53,17 @@ class Jitted:
         self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
         self.coming: Future | None = None
 
-    def __call__(self, *arguments: Any) -> Any:
+    def ready(self, *arguments: Any) -> None:
+        """Wait until it is compiled for arguments of these shapes."""
         if self.compiled is None:
             began = time.monotonic()
-            self.compiled = self.coming.result() if self.coming else self.compile(*arguments)
+            self.compiled = (self.coming or begun(self.compile, *arguments)).result()
             self.seconds = time.monotonic() - began
-        return jax.block_until_ready(self.compiled(*arguments))
+
+    def __call__(self, *arguments: Any) -> Any:
+        self.ready(*arguments)
+        compiled: Any = self.compiled
+        return begun(lambda: jax.block_until_ready(compiled(*arguments))).result()
 
     def compile(self, *arguments: Any) -> Any:
         """The function compiled for arguments of these shapes."""
@@ -77,10 +85,10 @@ class Program:
         side_by_side: bool | None = None,
     ) -> None:
         self.mesh, self.seeds = over, seeds
-        # Evaluation episodes. A GPU takes as long for one as for twenty; a processor does not, and would have one
-        # more program to compile. Of a plant on the host, whose trouble is kept there, there is one.
-        able = jax.default_backend() != "cpu" and not hasattr(experiment.task.plant, "trouble")
-        self.side_by_side = able if side_by_side is None else side_by_side
+        self.drive, self.horizon = experiment.drive, experiment.task.horizon
+        # Evaluation episodes. A GPU takes as long for one as for twenty; a CPU does not, and would have one more
+        # program to compile.
+        self.side_by_side = jax.default_backend() != "cpu" if side_by_side is None else side_by_side
         self.chunk = chunk(search_steps)
         self.chunks = search_steps // self.chunk
         functions = {
@@ -90,7 +98,7 @@ class Program:
             "absorb": (experiment.absorb, (0, 0)),
             "fit": (experiment.fit, (0,)),
             "search": (partial(experiment.search, steps=self.chunk), (0, None)),
-            "imagine": (experiment.imagine, (0,)),
+            "succeed": (experiment.succeed, (0, 0)),
             "calibrate": (experiment.calibrate, (0, 0)),
         }
         self.axes = {name: axes for name, (_, axes) in functions.items()}
@@ -104,6 +112,8 @@ class Program:
             for name, (function, axes) in functions.items()
         }
         self.spent: dict[str, float] = {}
+        # Told of a part while its caller waits for the compiler; whoever shows progress puts its own here.
+        self.on_compile: Callable[[str], AbstractContextManager[Any]] = nullcontext
 
     def prepare(self, part: str, *others: Any) -> None:
         """Begin to compile a part of states and `others`, or of states and a whole number, while others are at work."""
@@ -116,9 +126,7 @@ class Program:
         arguments: tuple[Any, ...] = (states, *rest)
         if self.mesh is not None:
             arguments = self.laid_out(part, arguments, described)
-        worker = ThreadPoolExecutor(1)
-        jitted.coming = worker.submit(jitted.compile, *arguments)
-        worker.shutdown(wait=False)
+        jitted.coming = begun(jitted.compile, *arguments)
 
     def laid_out(self, part: str, arguments: tuple, lay: Callable[[Any, NamedSharding], Any]) -> tuple:
         """A part's arguments on the mesh: those that all seeds share whole on every device, the others by seeds."""
@@ -128,18 +136,36 @@ class Program:
 
     def __call__(self, part: str, *arguments: Any, purpose: str | None = None) -> Any:
         """Run a part; its time is counted as that of `purpose`."""
+        interrupt.check()  # one that came while a library swallowed it
         jitted, name = self.parts[part], purpose or part
         if self.mesh is not None:
             arguments = self.laid_out(part, arguments, placed)
         began, compiled = time.monotonic(), jitted.seconds
+        if jitted.compiled is None:
+            with self.on_compile(part):
+                jitted.ready(*arguments)
         result = jitted(*arguments)
         compiling = jitted.seconds - compiled
         self.spent[name] = self.spent.get(name, 0.0) + time.monotonic() - began - compiling
         self.spent["compile"] = self.spent.get("compile", 0.0) + compiling
         return result
 
+    def collect(self, keys: Any, params: Params, exploring: bool, purpose: str = "collect") -> list[Episode]:
+        """An episode of each seed's policy [S, ...], or of random controls."""
+        if self.drive is None:
+            ran: Trajectory = fetched(self("episode", keys, params, jnp.asarray(exploring), purpose=purpose))
+            alone = [trimmed(jax.tree.map(lambda leaf: leaf[i], ran)) for i in range(self.seeds)]  # noqa: B023
+            return [Episode(one, "horizon" if len(one.u) == self.horizon else "terminated") for one in alone]
+        began = time.monotonic()
+        found = [
+            self.drive(keys[i], jax.tree.map(lambda leaf: leaf[i], params), exploring)  # noqa: B023
+            for i in range(self.seeds)
+        ]
+        self.spent[purpose] = self.spent.get(purpose, 0.0) + time.monotonic() - began
+        return found
+
     def evaluate(self, keys: Any, params: Any) -> np.ndarray:
-        """Costs [S, E, H] of episodes of the policies, one for each key [S, E]."""
+        """Costs [S, E, H] of episodes on a plant in JAX of the policies, one for each key [S, E]."""
         follow = jnp.asarray(False)  # the policy, not random controls
         if self.side_by_side:
             return np.asarray(fetched(self("evaluate", keys, params, follow).cost))
@@ -150,6 +176,23 @@ class Program:
         """Seconds spent in each part since the last call."""
         spent, self.spent = self.spent, {}
         return {name: round(spent.get(name, 0.0), 3) for name in NAMES}
+
+
+def begun(function: Callable[..., Any], *arguments: Any) -> Future:
+    """The function's result to come. Another thread computes it, so that a signal always finds this one awake.
+
+    A thread that does not keep the process alive: who is asked to stop does not wait for the compiler.
+    """
+    coming: Future = Future()
+
+    def work() -> None:
+        try:
+            coming.set_result(function(*arguments))
+        except BaseException as error:
+            coming.set_exception(error)
+
+    Thread(target=work, daemon=True).start()
+    return coming
 
 
 def share_processors(seeds: int, particles: int | None = None) -> None:
@@ -245,5 +288,4 @@ def leads() -> bool:
 
 def chunk(steps: int) -> int:
     """Search iterations between two looks at the clock: a divisor of `steps` near a tenth of it."""
-    divisors = [d for d in range(1, steps + 1) if steps % d == 0]
-    return next(d for d in divisors if d * 20 >= steps)
+    return next(d for d in range(-(-steps // 20), steps + 1) if steps % d == 0)

@@ -1,53 +1,237 @@
-"""What a person sees while a run goes on: a live line on a terminal, plain lines elsewhere."""
+"""What a person reads while a command runs: what it will do, where it is, and how each trial went."""
 
+from __future__ import annotations
+
+import shlex
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from pegasus_jax.types import Array
+from pegasus_jax.config import Config
+from pegasus_jax.defaults import label
+
+# A phase, and what it is called. A trial that begins with `read` finds its episode on disk, for example after a kill.
+PHASES = {
+    "read": "reading its episode from disk",
+    "collect": "running its episode",
+    "fit": "fitting the model",
+    "search": "searching a policy",
+    "evaluate": "evaluating the policy",
+}
+# A compiled part of an experiment, and what it is called.
+PARTS = {
+    "init": "the start",
+    "episode": "the episode",
+    "absorb": "the data set",
+    "fit": "the fit",
+    "search": "the search",
+    "succeed": "the imagined rollouts",
+    "calibrate": "the test of the model",
+    "evaluate": "the evaluation",
+}
+BRIEF = 1.0  # [s] a phase that is shorter has no line in a log
+SILENCE = 10.0  # [s] after so long a log has a line again
+LATEST = 3  # so many trials say how long the next one takes
+COMPILING = 0.1  # a trial that waits for the compiler for more than this part of its time says nothing of the next
 
 
 class Display:
-    """Shows where a run is. `phase` and `advance` move the live line; `line` prints one that stays."""
+    """Shows where a run is: a live line on a terminal, elsewhere a line for every phase that takes a while.
 
-    def __init__(self, trials: int, done: int, console: Console | None = None, quiet: bool = False) -> None:
+    `phase` and `compiling` say what is being done, `line` prints a line that stays.
+    """
+
+    def __init__(self, trials: int, console: Console | None = None, quiet: bool = False) -> None:
         self.console = console or Console(file=sys.stderr, highlight=False, quiet=quiet)
-        self.trials, self.done, self.began = trials, done, time.monotonic()
-        self.ran = 0.0  # trials finished here, in fractions
+        self.trials = trials
+        self.what, self.stage, self.since = "preparing", "preparing", time.monotonic()
+        self.said, self.spoke = "", self.since  # the last line of a log, and when
+        self.clock = Clock()
         self.live: Progress | None = None
-        self.task = None
+        self.task: Any = None
 
     @contextmanager
-    def running(self) -> Iterator["Display"]:
-        """Keep the live line up, where there is a terminal, until the block ends."""
-        if not self.console.is_terminal:
-            yield self
+    def running(self) -> Iterator[Display]:
+        """Keep the display up until the block ends."""
+        if self.console.is_terminal:
+            columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[left]}"))
+            with Progress(*columns, console=self.console, transient=True) as self.live:
+                self.task = self.live.add_task(self.what, total=1.0, left="")
+                yield self
+            self.live = None
             return
-        columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[left]}"))
-        with Progress(*columns, console=self.console, transient=True) as self.live:
-            self.task = self.live.add_task("starting", total=1.0, left="")
+        over = threading.Event()
+        threading.Thread(target=self._log, args=(over,), daemon=True).start()
+        try:
             yield self
-        self.live = None
+        finally:
+            over.set()
 
-    def phase(self, trial: int, what: str, fraction: float = 0.0, cost: float | Array | None = None) -> None:
-        """Trial `trial` is doing `what`, `fraction` of the whole trial is behind."""
-        if self.live is None or self.task is None:
-            return
-        self.ran = trial - 1 - self.done + fraction
-        spent = time.monotonic() - self.began
-        left = spent / self.ran * (self.trials - self.done - self.ran) if self.ran > 0.2 else None
+    def phase(self, trial: int, what: str, fraction: float = 0.0, cost: Any = None) -> None:
+        """Trial `trial` is doing `what`; `fraction` of it is done, and `cost` [] is what was imagined last."""
+        self.clock.phase(trial, what)
+        left = self.clock.left(self.trials)
         note = "" if cost is None else f"  imagined cost {float(cost):.3f}"
-        self.live.update(
-            self.task,
-            completed=fraction,
-            description=f"trial {trial}/{self.trials}  {what:<8}{note}",
-            left="" if left is None else f"{left:.0f} s left",
+        self._show(
+            f"trial {trial}/{self.trials}  {PHASES.get(what, what)}{note}",
+            fraction,
+            "" if left is None else f"about {duration(left)} left",
+            stage=f"{trial} {what}",
         )
+
+    @contextmanager
+    def compiling(self, part: str) -> Iterator[None]:
+        """Say so while the caller waits for a part's compiled program, which happens once."""
+        before, began = self.what, time.monotonic()
+        self._show(f"compiling {PARTS.get(part, part)} (once)")
+        try:
+            yield
+        finally:
+            self.clock.compiled += time.monotonic() - began
+            self._show(before)
 
     def line(self, text: str) -> None:
         """Print a line that stays."""
+        self.spoke = time.monotonic()
         self.console.print(text, markup=False, soft_wrap=True)
+
+    def _show(self, what: str, fraction: float | None = None, left: str | None = None, stage: str = "") -> None:
+        stage = stage or what
+        if stage != self.stage:
+            self.stage, self.since = stage, time.monotonic()
+        self.what = what
+        if self.live is not None:
+            fields: dict[str, Any] = {} if left is None else {"left": left}
+            self.live.update(self.task, description=what, completed=fraction, **fields)
+
+    def _log(self, over: threading.Event) -> None:
+        """The lines of a log, printed by a thread because the phases themselves are at work."""
+        while not over.wait(BRIEF / 4):
+            now = time.monotonic()
+            fresh = self.stage != self.said and now - self.since > BRIEF and now - self.spoke > BRIEF
+            if fresh or now - self.spoke > SILENCE:
+                self.said = self.stage
+                left = self.clock.left(self.trials)
+                self.line(self.what if left is None else f"{self.what}  about {duration(left)} left")
+
+
+class Clock:
+    """How long the trials take that say something of the next ones: no compiling, no episode from disk, a search."""
+
+    def __init__(self) -> None:
+        self.trial, self.began, self.phases = 0, time.monotonic(), set()
+        self.compiled = 0.0  # [s] of this trial spent waiting for the compiler
+        self.steady: list[float] = []  # [s] what such trials took, the newest last
+
+    def phase(self, trial: int, what: str) -> None:
+        """Trial `trial` is doing `what`."""
+        if trial != self.trial:
+            spent = time.monotonic() - self.began
+            if "search" in self.phases and "read" not in self.phases and self.compiled <= COMPILING * spent:
+                self.steady.append(spent)
+            self.trial, self.began, self.compiled, self.phases = trial, time.monotonic(), 0.0, set()
+        self.phases.add(what)
+
+    def left(self, trials: int) -> float | None:
+        """Seconds until the last of `trials` is done; None as long as no trial has shown it."""
+        if not self.steady:
+            return None
+        one = float(np.mean(self.steady[-LATEST:]))
+        return one * (trials - self.trial) + max(0.0, one - (time.monotonic() - self.began))
+
+
+def duration(seconds: float) -> str:
+    """A time that a person waits: "40 s", "5 min", "2.5 h"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 100 * 60 else f"{seconds / 3600:.1f} h"
+
+
+def announcement(config: Config, home: Path, seeds: int = 1, done: int | None = None) -> str:
+    """What a command will do, before it does anything: `done` trials of the run are there, None for a new one."""
+    what = f"{label(config)}, model {config.model.kind}, policy {config.policy.kind}"
+    several = f", {seeds} seeds" if seeds > 1 else ""
+    if done is None:
+        return f"learning {what}: {config.trials} trials{several}, folder {home}"
+    return f"going on with {home}: {what}, {done} of {config.trials} trials are done{several}"
+
+
+def devices() -> str:
+    """Where JAX computes, in words."""
+    import jax
+
+    found = jax.devices()
+    kind = "the CPU" if found[0].platform == "cpu" else found[0].device_kind
+    return f"running on {kind}" + (f", {len(found)} devices" if len(found) > 1 else "")
+
+
+def stopped(home: Path) -> str:
+    """What a person who has stopped a run can do next."""
+    if not (home / "config.yaml").exists() and not any(home.glob("seed*/config.yaml")):
+        return f"stopped before anything was written to {home}; the same command begins again"
+    return f"stopped; every finished episode is kept, pegasus-train resume={shlex.quote(str(home))} goes on"
+
+
+def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
+    """A trial in one line, from the row of each seed; of several seeds the means, and the median of the errors."""
+    first, several = rows[0], len(rows) > 1
+    measured = first["mean_cost"] is not None
+    skipped = sum(row["skipped_updates"] for row in rows)
+    solved = sum(row["success_rate"] >= 0.9 for row in rows) if measured else 0
+    errors = [row["calibration"] for row in rows if row["calibration"] is not None]
+    parts = [
+        f"trial {first['trial']:>2}/{trials}",
+        f"{first['plant_seconds']:.1f} s of plant",
+        f"{executed(rows)}: cost {_mean(rows, 'episode_cost'):.3f}",
+        learned(rows),
+        f"{solved} of {len(rows)} seeds solved" if measured and several else "",
+        f"model errors {np.median(errors):.1f} times as large as predicted" if errors else "",
+        f"{skipped} updates skipped" if skipped else "",
+        f"({sum(first['seconds'].values()):.0f} s, {first['seconds']['compile']:.0f} s of it compiling)",
+    ]
+    return "  ".join(part for part in parts if part)
+
+
+def executed(rows: Sequence[dict[str, Any]]) -> str:
+    """Whose episode a trial's was: `policy` is the trial that learned the executed policy, 0 for random controls."""
+    policies = {row.get("policy", 0 if row["random"] else row["trial"] - 1) for row in rows}
+    if policies == {0}:
+        return "episode of random controls"
+    return f"episode by the policy of trial {policies.pop()}" if len(policies) == 1 else "episodes"
+
+
+def learned(rows: Sequence[dict[str, Any]]) -> str:
+    """What is known of the policy that a trial ends with: from its evaluation, and from imagined episodes."""
+    parts = []
+    if rows[0]["mean_cost"] is not None:
+        parts += [f"cost {_mean(rows, 'mean_cost'):.3f}", f"success {_mean(rows, 'success_rate'):.0%}"]
+    if (imagined := _mean(rows, "objective_last")) is not None:
+        parts.append(f"imagined cost {imagined:.3f}")
+    kept = all(row.get("replaced") is False for row in rows)
+    return f"policy {'kept' if kept else 'now'}: {', '.join(parts)}" if parts else ""
+
+
+def best_line(rows: Sequence[dict[str, Any]], trial: int) -> str:
+    """The trial with the best policy of a run, and what its evaluation, or else its own episodes, say of it."""
+    if all(row["objective_fresh"] is None for row in rows):
+        return "no policy was learned: every episode was of random controls"
+    row = rows[trial - 1]
+    own = [other["episode_cost"] for other in rows if other.get("policy") == trial]
+    if row["mean_cost"] is not None:
+        known = f"success {row['success_rate']:.0%}, cost {row['mean_cost']:.3f}"
+    else:
+        known = f"cost {np.mean(own):.3f} in {len(own)} of the episodes" if own else "not run yet"
+    return f"best policy: trial {trial} ({known})"
+
+
+def _mean(rows: Sequence[dict[str, Any]], name: str) -> float | None:
+    values = [row[name] for row in rows if row[name] is not None]
+    return float(np.mean(values)) if values else None

@@ -12,12 +12,14 @@
 Files appear whole or not at all: written beside their place, flushed to disk, then renamed.
 """
 
+from __future__ import annotations
+
 import json
 import re
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from filelock import FileLock, Timeout
@@ -26,7 +28,9 @@ from pegasus_jax import facts
 from pegasus_jax.checks import RunError, SettingError
 from pegasus_jax.files import strict, write_json, write_whole
 from pegasus_jax.machine import about
-from pegasus_jax.types import Rollout, Task, Trajectory
+
+if TYPE_CHECKING:  # JAX is imported where it is needed: a command names its folder before it waits for that
+    from pegasus_jax.types import Episode, Rollout, Task, Trajectory
 
 FILES = ("config.yaml", "run.json", "trials.jsonl", ".lock")
 FOLDERS = ("episodes", "imagined", "checkpoints", "tensorboard", "plots")
@@ -36,7 +40,7 @@ UNFINISHED = re.compile(
     r"\.\w{8}|\.play\.\w{8}"
 )
 ENDED = ("horizon", "terminated", "truncated", "error", "interrupted")  # how an episode can end
-CUT = ("error", "interrupted")  # of these, by what is no doing of the policy
+CUT = ENDED[3:]  # of these, by what is no doing of the policy
 # What a row of trials.jsonl says in numbers, and readers of it use.
 COLUMNS = ("plant_seconds", "episode_cost", "mean_cost", "success_rate", "objective_last", "objective_fresh")
 
@@ -145,13 +149,18 @@ def save_episode(run: Path, trial: int, episode: Trajectory, task: Task, *, poli
     write_whole(episode_path(run, trial), lambda file: np.savez(file, **arrays, **known))  # type: ignore[arg-type]
 
 
-def load_episode(run: Path, trial: int) -> Trajectory | None:
+def load_episode(run: Path, trial: int) -> Episode | None:
     """The episode of a trial, of L <= H control periods, or None when it was never finished.
 
     Raises RunError for a file that cannot be read, or is not this trial's episode of this run's task.
     """
     found = _episode(run, trial)
-    return None if found is None else Trajectory(found["x"], found["u"], found["cost"])
+    if found is None:
+        return None
+    from pegasus_jax.types import Episode, Trajectory
+
+    rows = (found[name] for name in ("x", "u", "cost"))
+    return Episode(Trajectory(*rows), str(found["ended"]))  # type: ignore[arg-type]
 
 
 def origin(run: Path, trial: int) -> tuple[int, str] | None:
@@ -187,7 +196,7 @@ def _wrong(found: dict[str, np.ndarray], trial: int, task: Task) -> str | None:
             f"has x {list(x.shape)}, u {list(u.shape)} and cost {list(cost.shape)}; expected [L+1, {states}],"
             f" [L, {controls}] and [L], L at most {task.horizon}"
         )
-    if not all(np.isfinite(array).all() for array in (x, u, cost)):
+    if not all(np.isfinite(array).all() for array in (x, u)):
         return "has numbers that are not finite"
     margin = 1e-5 * (np.asarray(task.control_high) - task.control_low)  # of rounding
     if np.any(u < task.control_low - margin) or np.any(u > task.control_high + margin):
@@ -268,20 +277,19 @@ def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None =
     """The trial after which the best policy was learned, judged by the rows of trials.jsonl, of which there is one.
 
     Where every policy was evaluated, that with the highest success rate, and of these with the lowest mean cost. Else
-    that whose own episodes on the plant cost least, on average; `last_episode` is one more than there are rows. What
-    a fault or a person cut short does not count. A policy that never ran is chosen only where none ran: the last one.
-    Among equals it is the latest.
+    by its own episodes on the plant: that of which most succeeded, and of these with the lowest mean cost;
+    `last_episode` is one more than there are rows. What a fault or a person cut short does not count. A policy that
+    never ran is chosen only where none ran: the last one. Among equals it is the latest.
     """
     if all(row["mean_cost"] is not None and row["success_rate"] is not None for row in rows):
         return max(rows, key=lambda row: (row["success_rate"], -row["mean_cost"], row["trial"]))["trial"]
-    costs: dict[int, list[float]] = {}
+    own: dict[int, list[tuple[float, float]]] = {}  # of each policy, (failed, cost) of its episodes
     for row in [*rows, *([last_episode] if last_episode else [])]:
-        policy = row["policy"] if "policy" in row else 0 if row.get("random") else row["trial"] - 1
-        if policy and row["episode_cost"] is not None and row.get("ended", "horizon") not in CUT:
-            costs.setdefault(policy, []).append(row["episode_cost"])
-    if not costs:
+        if row["policy"] and row["episode_cost"] is not None and row["ended"] not in CUT:
+            own.setdefault(row["policy"], []).append((1.0 - row["episode_success"], row["episode_cost"]))
+    if not own:
         return rows[-1]["trial"]
-    return min(costs, key=lambda policy: (sum(costs[policy]) / len(costs[policy]), -policy))
+    return min(own, key=lambda policy: (*np.mean(own[policy], 0), -policy))
 
 
 def task_of(run: Path) -> Task:

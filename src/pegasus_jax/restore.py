@@ -21,6 +21,7 @@ from pegasus_jax import checkpoint, facts, record, settings, tasks
 from pegasus_jax.build import compose, set_precision
 from pegasus_jax.checks import RunError, SettingError
 from pegasus_jax.config import Config
+from pegasus_jax.episode import verdict
 from pegasus_jax.types import Experiment, Learner, RunState, Task
 
 Trial = int | str  # a number, or one of:
@@ -74,19 +75,14 @@ def best(run: Path) -> int:
     if not rows:
         raise RunError(f"{run} has no finished trial yet")
     following = len(rows) + 1
-    episode, origin = record.load_episode(run, following), record.origin(run, following)
+    ran, origin = record.load_episode(run, following), record.origin(run, following)
     last = None
-    if episode is not None and origin is not None and len(episode.cost):
-        last = {"policy": origin[0], "ended": origin[1], "episode_cost": mean_cost(episode.cost)}
+    if ran is not None and origin is not None and len(ran.trajectory.u) and np.isfinite(ran.trajectory.cost).all():
+        last = {"policy": origin[0], "ended": ran.ended, **verdict(ran, record.task_of(run))}
     try:
         return record.best_trial(rows, last)
     except (KeyError, TypeError) as error:
         raise RunError(f"{run / 'trials.jsonl'} has rows that this version cannot judge") from error
-
-
-def mean_cost(cost: Any) -> float:
-    """The mean cost a step of an episode [L]; the same number for an episode just run and for one read back."""
-    return float(np.mean(np.asarray(cost), dtype=np.float64))
 
 
 def newest(runs: Sequence[Path], like: RunState, candidates: Sequence[int]) -> tuple[RunState | None, list[str]]:

@@ -1,7 +1,10 @@
 """The command line's `key=value` words -> a checked Config, through OmegaConf's structured configs."""
 
 import dataclasses
+import json
 from collections.abc import Sequence
+from difflib import get_close_matches
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -9,14 +12,14 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from pegasus_jax import tasks
-from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.checks import SettingError, called, nearest, shown
 from pegasus_jax.config import Config
+from pegasus_jax.defaults import BEST, NAMES, defaults
 from pegasus_jax.files import write_whole
 from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 
 # Keys that select a named variant, and what they select from.
-VARIANTS: dict[str, Any] = {"task": tasks.NAMES, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
+VARIANTS: dict[str, Any] = {"task": NAMES, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
 
 
 def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, str], dict[str, str]]:
@@ -25,6 +28,10 @@ def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, 
     for word in words:
         key, equals, value = word.partition("=")
         if not equals or not key:
+            if any(part.startswith("=") or part.endswith("=") for part in words):
+                raise SettingError(
+                    f"'{word}' is not of the form key=value; write no spaces around =, as in task=cartpole"
+                )
             choices = [*options, *VARIANTS, *leaves(Config())]
             raise SettingError(f"'{word}' is not of the form key=value; {_hint(word.lstrip('-'), choices)}")
         (known if key in options else rest)[key] = value
@@ -33,7 +40,7 @@ def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, 
 
 def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     """The config of a command line: defaults, then the variants' and the task's, then the dotted settings."""
-    words = dict(words)
+    words = _with_arguments(words)
     chosen = {name: words.pop(name) for name in VARIANTS if name in words}
     for name, value in chosen.items():
         if value not in VARIANTS[name]:
@@ -41,7 +48,7 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     task, algorithm = chosen.get("task", Config.task), chosen.get("algorithm", "pegasus")
     # What suits a task best goes with the best algorithm and where no model is named; the rest is the paper's.
     own = algorithm == "pegasus" and "model" not in chosen
-    best, changes = tasks.BEST.get(task, ("log_normal", {})) if own else (chosen.get("model", "log_normal"), {})
+    best, changes = BEST.get(task, ("log_normal", {})) if own else (chosen.get("model", "log_normal"), {})
     variants: dict[str, Any] = {
         **MODELS[best],
         **changes,
@@ -51,14 +58,41 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     sections = {name: value for name, value in variants.items() if dataclasses.is_dataclass(value)}
     config = dataclasses.replace(Config(task=task), **sections)
     config = override(config, values({key: words[key] for key in ("legs",) if key in words}))
-    for changes in (tasks.defaults(config.task, config.legs), {k: v for k, v in variants.items() if k not in sections}):
+    for changes in (defaults(config.task, config.legs), {k: v for k, v in variants.items() if k not in sections}):
         there = leaves(config)
         config = override(config, {key: value for key, value in changes.items() if key in there})
-    known = leaves(config)
+    known, of_some = leaves(config), used_by()
     for key in words:
         if key not in known:
             raise SettingError(f"{key} is not a setting; {_hint(key, [*known, *VARIANTS, *options])}")
+        if task not in of_some.get(key, (task,)):
+            raise SettingError(
+                f"{key}={shown(words[key])} is of no use with task={task}; the nearest task that uses it is"
+                f" task={_nearest_of(task, of_some[key])}"
+            )
     return override(config, values(words))
+
+
+def used_by() -> dict[str, tuple[str, ...]]:
+    """Setting -> the tasks that use it, of those settings that not every task uses."""
+    patterns = {f.name: f.metadata.get("of", ()) for f in dataclasses.fields(Config)}
+    return {
+        name: tuple(task for task in NAMES if any(fnmatch(task, pattern) for pattern in of))
+        for name, of in patterns.items()
+        if of
+    }
+
+
+def _nearest_of(task: str, choices: Sequence[str]) -> str:
+    return (get_close_matches(task, choices, n=1) or [choices[0]])[0]
+
+
+def _with_arguments(words: dict[str, str]) -> dict[str, str]:
+    """The words, with those of env_args.NAME=VALUE as one list."""
+    prefix = "env_args."
+    given = [f"{key.removeprefix(prefix)}={value}" for key, value in words.items() if key.startswith(prefix)]
+    rest = {key: value for key, value in words.items() if not key.startswith(prefix)}
+    return rest | ({"env_args": json.dumps(given)} if given else {})
 
 
 def values(words: dict[str, str]) -> dict[str, Any]:
@@ -96,7 +130,7 @@ def help_lines(node: Any, prefix: str = "") -> list[str]:
         if dataclasses.is_dataclass(value):
             lines += help_lines(value, f"{prefix}{f.name}.")
         elif f"{prefix}{f.name}" not in VARIANTS and f.metadata["help"]:
-            lines.append(f"  {prefix + f.name + '=' + _text(value):34s} {f.metadata.get('help', '')}")
+            lines.append(f"  {prefix + f.name + '=' + shown(value):34s} {f.metadata.get('help', '')}")
     return lines
 
 
@@ -141,7 +175,7 @@ def _value(key: str, text: str) -> Any:
     try:
         return OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]))["value"]  # type: ignore[index,call-overload]
     except Exception as error:
-        raise SettingError(f"{key}={_text(text)} cannot be read as a value") from error
+        raise SettingError(f"{key}={shown(text)} cannot be read as a value") from error
 
 
 def _changed(node: Any, changes: dict[str, Any], prefix: str) -> Any:
@@ -161,7 +195,7 @@ def _changed(node: Any, changes: dict[str, Any], prefix: str) -> Any:
 def _converted(node: Any, name: str, value: Any, key: str) -> Any:
     """The value as the type of the dataclass's field of that name."""
     if "${" in str(value):  # OmegaConf would put another setting there, or a variable of the environment
-        raise SettingError(f"{key}={_text(value)} is not a value but a reference to one; write the value itself")
+        raise SettingError(f"{key}={shown(value)} is not a value but a reference to one; write the value itself")
     current = getattr(node, name)
     field = next(f for f in dataclasses.fields(node) if f.name == name)
     schema = OmegaConf.structured(dataclasses.make_dataclass("One", [(name, field.type, current)]))
@@ -169,32 +203,7 @@ def _converted(node: Any, name: str, value: Any, key: str) -> Any:
         merged = OmegaConf.merge(schema, {name: value})
         assert isinstance(merged, DictConfig)
         return getattr(OmegaConf.to_object(merged), name)
-    except (OmegaConfBaseException, TypeError, ValueError) as error:
+    except (OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
         raise SettingError(
-            f"{key}={_text(value)} is not {_kind(field.type)}; for example {key}={_text(current)}"
+            f"{key}={shown(value)} is not {called(field.type)}; for example {key}={shown(current)}"
         ) from error
-
-
-def _kind(annotation: Any) -> str:
-    return {
-        int: "a whole number",
-        float: "a number",
-        bool: "true or false",
-        str: "a word",
-        tuple[int, ...]: "a list of whole numbers",
-        tuple[float, ...]: "a list of numbers",
-        tuple[str, ...]: "a list of words",
-        str | None: "a word or null",
-        int | None: "a whole number or null",
-    }.get(annotation, "a number or null")
-
-
-def _text(value: Any) -> str:
-    if value is None:
-        return "null"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple | list):
-        return "[" + ",".join(map(str, value)) + "]"
-    text = f"{value:g}" if isinstance(value, float) else str(value)
-    return text if text.isprintable() else repr(text)

@@ -14,19 +14,20 @@ import numpy as np
 
 from pegasus_jax import mesh, settings
 from pegasus_jax.build import build, set_precision
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import SIZES, SettingError
 from pegasus_jax.config import Config
+from pegasus_jax.defaults import GYM
+from pegasus_jax.episode import succeeded
 from pegasus_jax.files import write_whole
 from pegasus_jax.program import LASTING, compiler_options, described
-from pegasus_jax.tasks import GYM
-from pegasus_jax.train import saturated, succeeded
+from pegasus_jax.train import saturated
 from pegasus_jax.trial import TrialInfo, trial
 from pegasus_jax.types import Array, Experiment, RunState, Task
 
 SOLVED = 0.9  # of a trial's evaluation episodes succeed
 
 # What is a seed's own; the trial is one number for all, so that the random trials are without a search in fact.
-SEEDS = RunState(0, 0, 0, 0, None)  # type: ignore[arg-type]
+SEEDS = RunState(0, 0, 0, 0, None, 0)  # type: ignore[arg-type]
 
 
 def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[str, Any]:
@@ -50,7 +51,7 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
 
     # What lies where: a seed's own on the devices for seeds, the number of the trial on all.
     own, all_the_same = (None, None) if over is None else (mesh.over_seeds(over), mesh.shared(over))
-    laid_out = RunState(own, own, own, own, all_the_same)  # type: ignore[arg-type]
+    laid_out = RunState(own, own, own, own, all_the_same, own)  # type: ignore[arg-type]
     keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
     states = jax.jit(each(experiment.init, (0,), SEEDS), out_shardings=laid_out)(keys)
     began = time.monotonic()
@@ -147,9 +148,15 @@ def seed_list(text: str) -> list[int]:
     """Seeds of '0-9' or '0,3,7'. Raises SettingError for anything else."""
     first, dash, last = text.partition("-")
     try:
-        seeds = list(range(int(first), int(last) + 1)) if dash else [int(part) for part in text.split(",")]
+        seeds = (
+            list(range(int(first), min(int(last), int(first) + SIZES["trials"]) + 1))
+            if dash
+            else [int(part) for part in text.split(",")]
+        )
     except ValueError:
         seeds = []
-    if not seeds or min(seeds) < 0:
-        raise SettingError(f"seeds={text} names no seeds; for example seeds=0-9 or seeds=0,3,7")
+    if not seeds or min(seeds) < 0 or len(seeds) > SIZES["trials"]:
+        raise SettingError(
+            f"seeds={text} names no seeds, or more than {SIZES['trials']:,}; for example seeds=0-9 or seeds=0,3,7"
+        )
     return seeds

@@ -1,11 +1,13 @@
 """The command pegasus-sweep: many runs that differ in a few settings, handed to a launcher that exists already."""
 
 import itertools
+import math
 import os
 import re
 import shlex
 import sys
 import time
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -40,6 +42,7 @@ examples
 
 OPTIONS = ("launcher", "jobs", "out", "seeds", "mesh")
 OF_TRAIN = ("seeds", "mesh")  # of those, pegasus-train's
+MOST = 10_000  # runs of a sweep: beyond is a slip of the keyboard
 YEAR = 365 * 24 * 60  # [min]
 PROGRAM = [sys.executable, "-c", "from pegasus_jax.cli import train; train()"]  # pegasus-train, wherever that is
 
@@ -53,7 +56,7 @@ class Job(NamedTuple):
 
 def sweep() -> None:
     """Entry point of pegasus-sweep."""
-    main(handle, SWEEP)
+    main(handle, SWEEP, stopped="every finished episode is kept, pegasus-train resume=RUN goes on with a run")
 
 
 def values(text: str) -> list[str]:
@@ -66,6 +69,9 @@ def values(text: str) -> list[str]:
         else:
             parts[-1] += letter
     ranges = [re.fullmatch(r"(\d+)-(\d+)", part) for part in parts]
+    for part, found in zip(parts, ranges, strict=True):
+        if found and int(found[2]) - int(found[1]) >= MOST:
+            raise SettingError(f"{part} is a range of more than {MOST:,} numbers; give fewer, for example 0-9")
     return [
         value
         for part, found in zip(parts, ranges, strict=True)
@@ -81,6 +87,8 @@ def jobs_of(words: dict[str, str], out: Path) -> list[Job]:
     choices = {key: values(text) for key, text in words.items()}
     if empty := [key for key, found in choices.items() if not found or "" in found]:
         raise SettingError(f"{empty[0]}={words[empty[0]]} has an empty value; for example seed=0,1,2 or seed=0-2")
+    if (count := math.prod(map(len, choices.values()))) > MOST:
+        raise SettingError(f"these are {count:,} combinations; a sweep has at most {MOST:,}")
     swept = [key for key, found in choices.items() if len(found) > 1]
     jobs = []
     for combination in itertools.product(*choices.values()):
@@ -89,8 +97,8 @@ def jobs_of(words: dict[str, str], out: Path) -> list[Job]:
         seed = [f"seed{chosen['seed']}"] if "seed" in swept else []
         run = out.joinpath(*(["_".join(names)] if names else []), *seed)
         jobs.append(Job(run, [*(f"{key}={value}" for key, value in chosen.items()), f"out={run}"]))
-    runs = [job.run for job in jobs]
-    if twice := next((run for run in runs if runs.count(run) > 1), None):
+    counts = Counter(job.run for job in jobs)
+    if twice := next((run for run, count in counts.items() if count > 1), None):
         raise SettingError(f"two combinations would share the folder {twice}; give each value once")
     return jobs
 

@@ -2,26 +2,27 @@
 
 import dataclasses
 import os
-import sys
 from collections.abc import Callable
 from functools import partial
-from importlib import import_module
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
+import gymnasium
 import numpy as np
 
-from pegasus_envs import mjcf
+from pegasus_envs import mjcf, mjcf_check
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
-from pegasus_envs.goals import Task as Manoeuvre
-from pegasus_envs.guest import Facts, facts, guest
+from pegasus_envs.gym_plant import EnvSpec, env_plant, env_spec, make_env, starts
+from pegasus_envs.gym_plant import close_environments as close_environments
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer import swimmer
+from pegasus_jax import interrupt, user_code
 from pegasus_jax.checks import SettingError, nearest
 from pegasus_jax.config import Config
 from pegasus_jax.cost import expected_saturating, saturating, widened
+from pegasus_jax.defaults import GYM, MANOEUVRES, MJCF
 from pegasus_jax.types import Task
 
 
@@ -51,101 +52,8 @@ def of_plant(name: str, plant: Plant) -> Task:
 TASKS: dict[str, Callable[[Any], Plant]] = {
     "cartpole": lambda legs: cartpole(),
     "double_cartpole": lambda legs: double_cartpole(),
-    **{f"swimmer_{manoeuvre}": partial(swimmer, manoeuvre) for manoeuvre in get_args(Manoeuvre)},
+    **{f"swimmer_{manoeuvre}": partial(swimmer, manoeuvre) for manoeuvre in MANOEUVRES},
 }
-
-GYM = "gym"  # the task that `env=` and `cost=` describe
-MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe
-NAMES = (*TASKS, GYM, MJCF)
-
-# The search that finds a way on most seeds: docs/decisions/0014 and 0015.
-_FINDING: dict[str, Any] = {"search.balanced": True, "search.refine": 0.5}
-
-# A cost of one's own has no width to widen; its expectation is a mean over nodes: docs/decisions/0018.
-_OWN_COST: dict[str, Any] = {"search.widen": 1.0, **_FINDING}
-
-_CARTPOLE: dict[str, Any] = {
-    "model.substeps": 1,  # no pole turns fast enough for two to matter
-    "search.widen": 2.0,
-    **_FINDING,
-}
-
-# docs/reference.md 2.2; the paper's networks, dropout and step size.
-_DOUBLE_CARTPOLE: dict[str, Any] = {
-    "trials": 40,
-    "model.hidden": (200,) * 4,
-    "policy.hidden": (50,) * 4,
-    "policy.dropout": 0.1,
-    "search.learning_rate": 1e-4,
-    "explore.trials": 2,
-}
-
-# docs/reference.md 3.4; what the legs do not change. The policy's dropout is the paper's .1, as on every plant.
-_SWIMMER: dict[str, Any] = {
-    "trials": 50,
-    "model.hidden": (200,) * 4,
-    "model.initialiser": "orthogonal",
-    "policy.hidden": (200,) * 4,
-    "policy.dropout": 0.1,
-    "policy.initialiser": "orthogonal",
-    "search.steps": 500,
-    "search.learning_rate": 1e-4,
-    "explore.trials": 5,
-    "explore.kind": "walk",
-    "search.cost": "particles",  # so it was measured
-    "search.widen": 1.0,
-    **_FINDING,
-    "search.anew": True,  # docs/decisions/0016
-}
-_LEGS: dict[int, dict[str, Any]] = {
-    2: {"search.particles": 400, "fit.steps": 2000},
-    6: {"search.particles": 500, "fit.steps": 4000},
-}
-
-
-# The model with which a task is learned best, where it is not the default one, and what is changed with it:
-# docs/decisions/0006, 0008, 0009 and, for the swimmer, 0017.
-BEST: dict[str, tuple[str, dict[str, Any]]] = {
-    **{
-        f"swimmer_{manoeuvre}": ("log_normal", {"model.members": 5, "model.kl_weight": 1.0})
-        for manoeuvre in get_args(Manoeuvre)
-    },
-    "cartpole": ("lagrangian", {}),
-    "double_cartpole": (
-        "lagrangian",
-        {
-            "model.substeps": 4,
-            "policy.dropout": 0.0,
-            "policy.input_units": (1.0, 3.0, 6.0, 8.0),
-            "fit.steps": 5000,
-            "fit.decay": 0.03,
-            "search.steps": 600,
-            "search.learning_rate": 3e-3,
-            "search.decay": 0.03,
-            "search.match": False,
-            "search.cost": "particles",
-            "search.anneal": 14,
-            "search.reheat": 0.17,
-            "search.limit": 1.0,
-            "search.loosen": 30.0,
-            "search.sensors": "known",
-            "explore.trials": 4,
-            "explore.kind": "walk",
-        },
-    ),
-}
-
-
-def defaults(name: str, legs: int = 2) -> dict[str, Any]:
-    """What a task changes in the defaults of config.py, by dotted name."""
-    if name in (GYM, MJCF):
-        return _OWN_COST
-    if name == "cartpole":
-        return _CARTPOLE
-    if name == "double_cartpole":
-        return _DOUBLE_CARTPOLE
-    faster = {"search.learning_rate": 1e-3} if (name, legs) == ("swimmer_depth_change", 2) else {}
-    return {**_SWIMMER, **_LEGS[legs], **faster}
 
 
 def make(name: str, legs: int = 2) -> Task:
@@ -157,7 +65,7 @@ def make(name: str, legs: int = 2) -> Task:
 
 def of_config(config: Config) -> Task:
     """The task that a config names."""
-    own = {GYM: of_guest, MJCF: of_mjcf}
+    own = {GYM: of_gym, MJCF: of_mjcf}
     return own[config.task](config) if config.task in own else make(config.task, config.legs)
 
 
@@ -193,14 +101,6 @@ def input_scale(task: Task, units: tuple[float, ...]) -> Any:
     return np.concatenate([1 / np.array(units), np.ones(2 * len(task.angles))]) if units else 1.0
 
 
-def label(config: Config) -> str:
-    """The task with what tells it from others of its name, as part of a folder's name."""
-    if config.task.startswith("swimmer_"):
-        return f"{config.task}-legs{config.legs}"
-    own = {GYM: config.env, MJCF: Path(config.mjcf or "").stem}.get(config.task)
-    return f"{config.task}-{own}".replace("/", "-").replace(":", "-") if own else config.task
-
-
 def pinned(config: Config) -> Config:
     """The config for a run's folder: it finds its MJCF file from anywhere.
 
@@ -209,10 +109,12 @@ def pinned(config: Config) -> Config:
     """
     if config.task == GYM:
         _complete(config)
+        environment(config)
+        given = {name: getattr(config, name) for name in EnvSpec._fields}
         try:
-            known = facts(config.env or "", **{name: getattr(config, name) for name in Facts._fields})
+            known = env_spec(config.env or "", config.env_args, **given)
         except ValueError as error:
-            raise SettingError(f"env={config.env}: {error}") from error
+            raise SettingError(f"env={config.env}: {' '.join(str(error).split())}") from error
         plain = {
             name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known._asdict().items()
         }
@@ -222,25 +124,96 @@ def pinned(config: Config) -> Config:
     return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf))
 
 
-def of_guest(config: Config) -> Task:
+def of_gym(config: Config) -> Task:
     """The task that a Gymnasium environment and a cost of its observations pose. Raises SettingError if they cannot."""
     _complete(config)
-    known: dict[str, Any] = {name: getattr(config, name) for name in Facts._fields}
+    known: dict[str, Any] = {name: getattr(config, name) for name in EnvSpec._fields}
     if any(value in (None, ()) for value in known.values()):
-        return of_guest(pinned(config))
+        return of_gym(pinned(config))
     known |= {name: np.array(value, float) for name, value in known.items() if isinstance(value, tuple)}
-    name, about = config.env or "", Facts(**known)
+    name, about = config.env or "", EnvSpec(**known)
     states = tuple(f"x{i}" for i in range(len(about.start_mean)))
     controls = tuple(f"u{i}" for i in range(len(about.control_low)))
-    task = _of_users(config, name, guest(name, len(states)), about, about.horizon, states, controls)
-    return task._replace(rates=_entries("rates", config.rates, name, len(states)))
+    task = _of_users(config, name, None, about, about.horizon, states, controls)
+    return task._replace(
+        rates=_entries("rates", config.rates, name, len(states)),
+        environment=env_plant(name, config.env_args, len(states)),
+    )
+
+
+def close(task: Task) -> None:
+    """Close the task's environment, if it has one and it is open."""
+    if task.environment is not None:
+        interrupt.let_go(task.environment.close)
 
 
 def _complete(config: Config) -> None:
     """Raises SettingError unless an environment is named, and a cost that there is: no robot is opened in vain."""
     if config.env is None or config.cost is None:
         raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
-    _function(config.cost)  # from now on modules in the working folder are found, the environment's too
+    user_code.load("cost", config.cost)
+    module, colon, _ = config.env.partition(":")
+    if colon:  # Gymnasium imports it, to register what is in it
+        user_code.importing(f"env={config.env}", module)
+
+
+def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the greatest observation [D] as far as its environment tells them, else infinite."""
+    if config.task == GYM:
+        space: Any = environment(config).observation_space
+        return np.asarray(space.low, float), np.asarray(space.high, float)
+    return np.full(len(task.state_names), -np.inf), np.full(len(task.state_names), np.inf)
+
+
+def readings(config: Config, task: Task, resets: int) -> np.ndarray:
+    """What an environment observes after so many resets [N, D]; N is 0 for a simulation of our own.
+
+    Raises SettingError, in one line, for what the environment raises.
+    """
+    if config.task != GYM:
+        return np.zeros((0, len(task.state_names)))
+    with user_code.blamed(f"env={config.env} cannot be reset"):
+        return starts(config.env or "", config.env_args, resets)
+
+
+def compared(config: Config, task: Task) -> None:
+    """Raises SettingError, in one line, where MJX does not simulate a task's MJCF file as MuJoCo does."""
+    if config.task == MJCF:
+        try:
+            mjcf_check.compare(task.plant)
+        except ValueError as error:
+            raise SettingError(f"mjcf={config.mjcf}: {error}") from error
+
+
+def described(config: Config) -> dict[str, str]:
+    """What an environment says of itself, by name."""
+    if config.task != GYM:
+        return {"model": config.mjcf} if config.mjcf else {}
+    env: Any = environment(config)
+    layers = [env]
+    while hasattr(layers[-1], "env"):
+        layers.append(layers[-1].env)
+    spaces = {"observes": env.observation_space, "is driven by": env.action_space}
+    return {
+        "environment": " of ".join(type(layer).__name__ for layer in layers),
+        **{k: str(v) for k, v in spaces.items()},
+    }
+
+
+def environment(config: Config) -> Any:
+    """The environment of a config, opened once a process. Raises SettingError, in one line, where it cannot be made."""
+    name, _, _ = (config.env or "").rpartition(":")
+    if name:
+        user_code.importing(f"env={config.env}", name)
+    try:
+        return make_env(config.env or "", config.env_args)
+    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        raise SettingError(f"env={config.env}: {str(error).splitlines()[0]}") from error
+    except Exception as error:
+        given = "; env_args.NAME=VALUE gives arguments" if isinstance(error, TypeError) else ""
+        raise SettingError(f"env={config.env} cannot be made: {user_code.told(error)}{given}") from error
+    finally:
+        interrupt.reclaim()
 
 
 def of_mjcf(config: Config) -> Task:
@@ -280,7 +253,7 @@ def _of_users(
     return Task(
         name=name,
         plant=plant,
-        cost=_function(config.cost or ""),
+        cost=user_code.load("cost", config.cost or ""),
         angles=_entries("angles", config.angles, name, len(states)),
         start_mean=about.start_mean,
         start_std=about.start_std,
@@ -291,6 +264,9 @@ def _of_users(
         dt=about.dt,
         state_names=states,
         control_names=controls,
+        success=config.success,
+        stop=None if config.stop is None else user_code.load("stop", config.stop),
+        stop_cost=config.stop_cost,
     )
 
 
@@ -302,17 +278,6 @@ def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> 
                 f"{setting}={entry} is not an entry of {name}'s observation; choose from 0 to {states - 1}"
             )
     return entries
-
-
-def _function(name: str) -> Callable[[Any], Any]:
-    """The function `module:function`, also from a module in the working folder."""
-    if os.getcwd() not in sys.path:
-        sys.path.append(os.getcwd())
-    module, _, function = name.partition(":")
-    try:
-        return getattr(import_module(module), function)
-    except (ImportError, AttributeError, ValueError) as error:
-        raise SettingError(f"cost={name} cannot be imported: {error}; expected cost=module:function") from error
 
 
 def pictures(task: Task, states: Any, width: int, height: int) -> list[np.ndarray]:

@@ -1,8 +1,7 @@
 """The main job: an experiment trial by trial, for one seed or many at once, leaving folders that survive anything."""
 
-import logging
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,16 +13,16 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
-from pegasus_jax import checkpoint, record, restore, settings
+from pegasus_jax import checkpoint, episode, record, restore, settings, tasks, user_code
 from pegasus_jax.board import Board
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.checks import RunError, SettingError
 from pegasus_jax.config import Config
 from pegasus_jax.dataset import grow
 from pegasus_jax.program import Program, fetched, leads
-from pegasus_jax.progress import Display
+from pegasus_jax.progress import Display, summary
 from pegasus_jax.trial import COLLECT, EVALUATE, trial_key
-from pegasus_jax.types import Experiment, Key, Params, RunState, Task, Trajectory
+from pegasus_jax.types import Episode, Experiment, Key, Params, RunState, Task, Trajectory
 
 # What `improved` says of a trial that has not improved anything.
 UNKNOWN: dict[str, Any] = {
@@ -31,19 +30,23 @@ UNKNOWN: dict[str, Any] = {
     "objective_first": None,
     "objective_last": None,
     "objective_fresh": None,
+    "objective_incumbent": None,
+    "replaced": None,
     "gradient_norm": None,
     "skipped_updates": 0,
 }
 UNMEASURED: dict[str, Any] = {"mean_cost": None, "success_rate": None}  # what `evaluate` says without episodes
 
 
-def train(config: Config, run: Path, *, resume: bool = False, command: str = "") -> RunState:
+def train(config: Config, run: Path, *, resume: bool = False, command: str = "", final: bool = False) -> RunState:
     """Run (or go on with) `config` in the folder `run`, and return the state after its last trial.
+
+    With `final` the last policy runs for one more episode: the first of the next trial, should the run go on.
 
     Killed at any moment and resumed, it ends bit-equal to an uninterrupted run: every trial's randomness is a function
     of seed and trial, finished episodes are read back, and a trial cut short is done again from the state before it.
     """
-    return part(train_seeds(config, {config.seed: run}, resume=resume, command=command), 0)
+    return part(train_seeds(config, {config.seed: run}, resume=resume, command=command, final=final), 0)
 
 
 def train_seeds(
@@ -52,6 +55,7 @@ def train_seeds(
     *,
     resume: bool = False,
     command: str = "",
+    final: bool = False,
     mesh: Mesh | None = None,
 ) -> RunState:
     """`train` for the seeds and folders of `runs`, all as one program; returns their states [S, ...].
@@ -71,13 +75,15 @@ def train_seeds(
             raise SettingError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
         set_precision(config)
         experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
+        held.callback(tasks.close, experiment.task)
         for run in folders if resume else ():
             restore.same(run, experiment.task)
         program = Program(experiment, config.search.steps, len(seeds), mesh)
-        display = Display(config.trials, 0, quiet=not leads())
+        display = Display(config.trials, quiet=not leads())
+        program.on_compile = held.enter_context(display.running()).compiling
         states = restore.together(folders, experiment, display.line) if resume else None
-        done = display.done = 0 if states is None else int(states.trial[0])
-        if done < config.trials:
+        done = 0 if states is None else int(states.trial[0])
+        if max(done + 1, config.explore.trials) <= config.trials:  # else no policy is searched
             program.prepare("search")
         keys = jnp.stack([jax.random.key(seed) for seed in seeds])
         if states is None:
@@ -96,16 +102,17 @@ def train_seeds(
             record.note(run, command, done, experiment.task)
             record.write_trials(run, record.readable_trials(run)[0][:done])
             boards.append(Board(run / "tensorboard", done + 1, display.line))
-        with display.running():
-            for trial in range(done + 1, config.trials + 1):
-                with on_plant(experiment.task, f"; resume={folders[0]} goes on from trial {trial}"):
-                    states, rows = one_trial(states, trial, config, folders, experiment, program, display)
-                whole = fetched(states)
-                for index, board in enumerate(boards):
-                    record.write_trials(folders[index], [*record.trials(folders[index]), rows[index]])
-                    board.add(rows[index])
-                    checkpoint.save(folders[index], trial, part(whole, index))
-                display.line(summary(rows, config.trials))
+        for trial in range(done + 1, config.trials + 1):
+            states, rows = one_trial(states, trial, config, folders, experiment, program, display)
+            whole = fetched(states)
+            for index, board in enumerate(boards):
+                record.write_trials(folders[index], [*record.trials(folders[index]), rows[index]])
+                board.add(rows[index])
+                checkpoint.save(folders[index], trial, part(whole, index))
+            display.line(summary(rows, config.trials))
+        if final:
+            display.phase(config.trials, "collect", 1.0)
+            collected(states, config.trials + 1, config, folders, experiment.task, program)
     return states
 
 
@@ -120,9 +127,12 @@ def one_trial(
 ) -> tuple[RunState, list[dict[str, Any]]]:
     """Collect (or read back) episodes, absorb, improve, evaluate; a row a run for its trials.jsonl says how it went."""
     task = experiment.task
-    display.phase(trial, "collect")
+    on_disk = all(record.episode_path(run, trial).exists() for run in runs)
+    display.phase(trial, "read" if on_disk else "collect")
+    policies = np.asarray(fetched(states.policy_trial))
     episodes = collected(states, trial, config, runs, task, program)
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *episodes)
+    shaped = [episode.padded(ran.trajectory, task.horizon) if task.may_end else ran.trajectory for ran in episodes]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *shaped)
     # Before this episode teaches the model, and after another has. No first trial should wait for the compiler.
     judged = trial > max(1, config.explore.trials)
     calibration = fetched(program("calibrate", states, stacked)) if judged else np.full(len(runs), np.nan)
@@ -132,20 +142,24 @@ def one_trial(
     display.phase(trial, "evaluate", 0.9)
     keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(fetched(states.key))
     evaluation = evaluate(keys, states.policy.params, task, program, config.evaluation)
+    random, rows_so_far = trial <= config.explore.trials, np.asarray(fetched(states.data.size))
     seconds = program.seconds()
     rows = [
         {
             "trial": trial,
-            "plant_seconds": round(trial * task.horizon * task.dt, 6),
-            "random": trial <= config.explore.trials,
-            "episode_cost": restore.mean_cost(episode.cost),
+            "plant_seconds": round(int(rows_so_far[index]) * task.dt, 6),
+            "random": random,
+            "policy": 0 if random else int(policies[index]),
+            **episode.verdict(ran, task),
+            "steps": len(ran.trajectory.u),
+            "ended": ran.ended,
             **evaluation[index],
             **found[index],
-            "saturated": float(saturated(episode.u, task)),
+            "saturated": float(saturated(ran.trajectory.u, task)),
             "calibration": known(calibration[index]),
             "seconds": seconds,
         }
-        for index, episode in enumerate(episodes)
+        for index, ran in enumerate(episodes)
     ]
     return states, rows
 
@@ -153,28 +167,40 @@ def one_trial(
 def improved(
     states: RunState, trial: int, runs: Sequence[Path], stacked: Trajectory, program: Program, display: Display
 ) -> tuple[RunState, list[dict[str, Any]]]:
-    """Fit, search, and imagine what comes; how it went, of each run."""
+    """Fit, search, and imagine what comes; how it went, of each run.
+
+    Raises RunError where no run's model, or no run's policy, could learn anything: nothing would follow from it.
+    """
     display.phase(trial, "fit", 0.02)
+    incumbents = states.policy.params
     states, fitted = fetched_info(program("fit", states))
+    if not np.isfinite(fitted.loss).any():
+        raise RunError(f"trial {trial}: the loss of the model's fit is {float(fitted.loss[0])}, so nothing was learned")
     found = []
     for i in range(program.chunks):
         cost = np.mean(found[-1].objective[:, -1]) if found else None
         display.phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)
         states, searched = fetched_info(program("search", states, jnp.int32(i * program.chunk)))
         found.append(jax.tree.map(np.asarray, searched))
-        program.prepare("imagine")  # once; not before the first of the search, for which everybody waits
+        program.prepare("succeed", incumbents)  # once; not before the first of the search, for which everybody waits
         program.prepare("calibrate", stacked)
     objective, norm = (np.concatenate([getattr(f, name) for f in found], 1) for name in ("objective", "gradient_norm"))
+    if not np.any(np.isfinite(objective) & np.isfinite(norm)):
+        raise RunError(
+            f"trial {trial}: the imagined cost or its gradient is not finite in any iteration, so nothing was learned"
+        )
     skipped = fitted.skipped + sum(f.skipped for f in found)
-    imagined, imagined_cost = fetched(program("imagine", states))
+    states, successor = fetched_info(program("succeed", states, incumbents, purpose="imagine"))
     for index, run in enumerate(runs if leads() else ()):
-        record.save_imagined(run, trial, part(imagined, index), imagined_cost[index])
+        record.save_imagined(run, trial, part(successor.rollout, index), successor.cost[index])
     return states, [
         {
             "fit_loss": float(fitted.loss[index]),
             "objective_first": float(objective[index, 0]),
             "objective_last": float(objective[index, -1]),
-            "objective_fresh": float(jnp.mean(imagined_cost[index])),
+            "objective_fresh": float(jnp.mean(successor.cost[index])),
+            "objective_incumbent": known(successor.incumbent[index]),
+            "replaced": bool(successor.replaced[index]),
             "gradient_norm": float(np.median(norm[index])),
             "skipped_updates": int(skipped[index]),
         }
@@ -184,55 +210,83 @@ def improved(
 
 def collected(
     states: RunState, trial: int, config: Config, runs: Sequence[Path], task: Task, program: Program
-) -> list[Trajectory]:
-    """The episodes of a trial: those on disk as they are, the others run on the plant and made durable."""
+) -> list[Episode]:
+    """The episodes of a trial: those on disk as they are, the others run on the plant and made durable.
+
+    Raises RunError where one failed, which is on disk as far as it came, or is not made of finite numbers; and
+    KeyboardInterrupt where a signal ended it.
+    """
     episodes = [record.load_episode(run, trial) for run in runs]
-    if any(episode is None for episode in episodes):
+    if any(ran is None for ran in episodes):
         keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(fetched(states.key))
-        exploring = jnp.asarray(trial <= config.explore.trials)
-        fresh = fetched(program("episode", keys, states.policy.params, exploring, purpose="collect"))
+        random = trial <= config.explore.trials
+        fresh = program.collect(keys, states.policy.params, random)
+        policies = np.asarray(fetched(states.policy_trial))
         for index, run in enumerate(runs):
             if episodes[index] is None:
-                episodes[index] = part(fresh, index)
-                if leads():
-                    policy = 0 if trial <= config.explore.trials else trial - 1
-                    record.save_episode(run, trial, part(fresh, index), task, policy=policy, ended="horizon")
-    return [episode for episode in episodes if episode is not None]
+                episodes[index] = ran = fresh[index]
+                finite(ran.trajectory, task, trial)
+                if leads() and len(ran.trajectory.u):
+                    record.save_episode(
+                        run, trial, ran.trajectory, task, policy=0 if random else int(policies[index]), ended=ran.ended
+                    )
+                failed(ran, task, f"; resume={run} goes on")
+    return [costed(ran, task, trial) for ran in episodes if ran is not None]
 
 
-@contextmanager
-def on_plant(task: Task, advice: str = "") -> Iterator[None]:
-    """What a plant on the host raises becomes one line, Ctrl-C itself; JAX would show a traceback of its insides."""
-    logging.getLogger("jax._src.callback").setLevel(logging.CRITICAL)
-    trouble: list[BaseException] = getattr(task.plant, "trouble", [])
-    trouble.clear()
-    try:
-        yield
-    except jax.errors.JaxRuntimeError as error:
-        if not trouble:
-            raise
-        cause = trouble[-1]
-        if isinstance(cause, KeyboardInterrupt):
-            raise cause from error
-        where = "".join(f" ({note})" for note in getattr(cause, "__notes__", []))
-        what = " ".join(f"{type(cause).__name__}: {cause}{where}".split())
-        raise RunError(f"{task.name} failed in an episode, {what}{advice}") from error
+def finite(trajectory: Trajectory, task: Task, trial: int) -> None:
+    """Raises RunError, which names trial and entry, for an episode that no model can learn from."""
+    x = np.asarray(trajectory.x)
+    for t, i in np.argwhere(~np.isfinite(x))[:1]:
+        raise RunError(
+            f"trial {trial}: {task.state_names[i]} is {x[t, i]} after {t} control periods of its episode;"
+            " the plant's simulation diverged: a smaller time step or softer parts may help"
+        )
+
+
+def costed(ran: Episode, task: Task, trial: int) -> Episode:
+    """The episode with its costs, which are counted again where they are not finite: the user may have mended the cost.
+
+    Raises RunError, which names trial and observation, where they are not finite then either.
+    """
+    if np.isfinite(ran.trajectory.cost).all():
+        return ran
+    x = np.asarray(ran.trajectory.x)
+    cost = np.asarray(jax.vmap(task.cost)(jnp.asarray(x[1:])))
+    for (t,) in np.argwhere(~np.isfinite(cost))[:1]:
+        raise RunError(f"trial {trial}: the cost of the observation {x[t + 1].tolist()} is {cost[t]}; mend the cost")
+    return ran._replace(trajectory=ran.trajectory._replace(cost=cost))
+
+
+def failed(ran: Episode, task: Task, advice: str = "") -> None:
+    """Raise what ended an episode on an environment before its time: RunError in one line, or the signal itself."""
+    if isinstance(ran.error, KeyboardInterrupt):
+        raise ran.error
+    if ran.error is not None:
+        kept = f"; its {len(ran.trajectory.u)} rows are kept" if len(ran.trajectory.u) else ""
+        raise RunError(f"{task.name} failed in an episode, {user_code.told(ran.error)}{kept}{advice}") from ran.error
 
 
 def evaluate(keys: Key, params: Params, task: Task, program: Program, episodes: int) -> list[dict[str, Any]]:
     """Mean cost a step and success rate of each seed [S], over fresh episodes, not data (docs/reference.md 10)."""
     if not episodes:
         return [UNMEASURED] * len(keys)
-    costs = program.evaluate(jax.vmap(lambda key: jax.random.split(key, episodes))(keys), params)
+    keys = jax.vmap(lambda key: jax.random.split(key, episodes))(keys)
+    costs = program.evaluate(keys, params) if task.environment is None else driven(keys, params, task, program)
     return [
         {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(success))}
-        for cost, success in zip(costs, succeeded(costs, task), strict=True)
+        for cost, success in zip(costs, episode.succeeded(costs, task), strict=True)
     ]
 
 
-def succeeded(costs: Any, task: Task) -> np.ndarray:
-    """Which episodes [...] of costs [..., H] succeeded: their last five steps cost little on average."""
-    return np.mean(costs[..., -5:], axis=-1) < task.success
+def driven(keys: Key, params: Params, task: Task, program: Program) -> np.ndarray:
+    """Costs [S, E, H] of episodes on an environment, the periods that an early end left out included."""
+    costs = []
+    for some in jnp.swapaxes(keys, 0, 1):
+        for ran in program.collect(some, params, False, purpose="evaluate"):
+            failed(ran, task)
+            costs.append(episode.charged(ran.trajectory.cost, task))
+    return np.reshape(costs, (keys.shape[1], keys.shape[0], task.horizon)).swapaxes(0, 1)
 
 
 def saturated(u: Any, task: Task) -> np.ndarray:
@@ -274,30 +328,8 @@ def evaluate_run(
     program = Program(experiment, 1)
     params = jax.tree.map(lambda leaf: leaf[None], state.policy.params)
     keys = jax.random.key(seed)[None]
-    with on_plant(experiment.task):
+    try:
         (result,) = evaluate(keys, params, experiment.task, program, episodes)
+    finally:
+        tasks.close(experiment.task)
     return {"trial": int(state.trial), "episodes": episodes, **result, "fingerprint": checkpoint.fingerprint(state)}
-
-
-def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
-    """A trial in one line; over several seeds the means, and the median calibration."""
-    measured = rows[0]["mean_cost"] is not None
-    names = ("mean_cost", "success_rate") if measured else ("episode_cost",)
-    mean = {name: np.mean([row[name] for row in rows]) for name in names}
-    imagined = [row["objective_last"] for row in rows if row["objective_last"] is not None]
-    first, skipped = rows[0], sum(row["skipped_updates"] for row in rows)
-    solved = sum(row["success_rate"] >= 0.9 for row in rows) if measured else 0
-    errors = [row["calibration"] for row in rows if row["calibration"] is not None]
-    return (
-        f"trial {first['trial']:>2}/{trials}  {first['plant_seconds']:6.1f} s of plant"
-        + (
-            f"  cost {mean['mean_cost']:.3f}  success {mean['success_rate']:4.0%}"
-            if measured
-            else f"  cost of its episode {mean['episode_cost']:.3f}"
-        )
-        + (f"  imagined {np.mean(imagined):.3f}" if imagined else "")
-        + (f"  calibration {np.median(errors):.1f}" if errors else "")
-        + (f"  {solved} of {len(rows)} seeds solved" if measured and len(rows) > 1 else "")
-        + f"  ({sum(first['seconds'].values()):.0f} s, {first['seconds']['compile']:.0f} s of it compiling)"
-        + (f"  {skipped} updates skipped" if skipped else "")
-    )

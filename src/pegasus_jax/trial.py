@@ -5,6 +5,9 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.core import Tracer
 
 from pegasus_jax import dataset, episode
 from pegasus_jax.calibration import calibration
@@ -12,7 +15,9 @@ from pegasus_jax.fit import FitInfo
 from pegasus_jax.search import SearchInfo
 from pegasus_jax.types import (
     Array,
+    Dataset,
     Dynamics,
+    Episode,
     Experiment,
     Fitter,
     Key,
@@ -22,6 +27,7 @@ from pegasus_jax.types import (
     Rollout,
     RunState,
     Searcher,
+    Successor,
     Task,
     Trajectory,
 )
@@ -60,11 +66,14 @@ def experiment(
     explore: Callable[[Key], Array],
     explore_trials: int,
     mean_execution: bool,
+    compare: bool,
     capacity: int,
 ) -> Experiment:
     """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned.
 
-    `imagine(key, policy parameters, belief)` rolls out fresh scenarios -> (rollout, cost [H, K]).
+    `imagine(key, policy parameters, belief)` rolls out fresh scenarios -> (rollout, cost [H, K]). With `compare` a new
+    policy takes the old one's place only where it is expected to cost less. With an environment instead of a plant in
+    JAX, `episode` and `collect` are not pure, and `drive` is there.
     """
     states, controls = len(task.state_names), len(task.control_names)
 
@@ -76,6 +85,7 @@ def experiment(
             dataset.empty(capacity, states, controls),
             Learner(model, fit.init(model)),
             Learner(controller, search.init(controller)),
+            jnp.int32(0),
             jnp.int32(0),
         )
 
@@ -92,19 +102,66 @@ def experiment(
 
         return episode.run(run_key, control, task)
 
+    # What an episode on an environment asks of JAX, each compiled once.
+    plan_of, noise_of = (
+        jax.jit(explore),
+        jax.jit(lambda key: jax.vmap(policy.sample)(jax.random.split(key, task.horizon))),
+    )
+    react, cost_of = jax.jit(policy.apply), jax.jit(jax.vmap(task.cost))
+
+    def drive(key: Key, policy_params: Params, exploring: bool) -> Episode:
+        """An episode on the environment, with the costs of its rows."""
+        plan_key, seed_key, noise_key = jax.random.split(key, 3)
+        seed = int(jax.random.randint(seed_key, (), 0, 2**31 - 1))
+        plan = np.asarray(plan_of(plan_key))
+        noise = jax.tree.map(np.asarray, noise_of(noise_key))
+        # Compiled before the robot moves: the first control is to be as quick as the others.
+        react(
+            policy_params, None if mean_execution else jax.tree.map(lambda z: z[0], noise), np.zeros(states, np.float32)
+        )
+
+        def control(t: int, x: np.ndarray) -> np.ndarray:
+            if exploring:
+                return plan[t]
+            drawn = None if mean_execution else jax.tree.map(lambda z: z[t], noise)
+            return np.asarray(react(policy_params, drawn, x))
+
+        found = episode.drive(seed, control, task)
+        whole = episode.padded(found.trajectory, task.horizon)
+        cost = np.asarray(cost_of(whole.x[1:]))[: len(found.trajectory.u)]
+        return found._replace(trajectory=found.trajectory._replace(cost=cost))
+
+    def driven(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
+        if isinstance(key, Tracer):
+            raise ValueError(f"task {task.name} has an environment, which nothing can trace: call this outside of jit")
+        found = drive(key, policy_params, bool(exploring))
+        if found.error is not None:
+            raise found.error
+        return episode.padded(found.trajectory, task.horizon)
+
     def collect(state: RunState) -> Trajectory:
         """The next episode: random controls in the first trials, the policy's afterwards (Alg. 1 line 3)."""
         key = trial_key(state.key, state.trial + 1, COLLECT)
-        return one_episode(key, state.policy.params, state.trial < explore_trials)
+        return run_episode(key, state.policy.params, state.trial < explore_trials)
+
+    run_episode = one_episode if task.environment is None else driven
 
     def absorb(state: RunState, trajectory: Trajectory) -> RunState:
-        """The run with one more episode in its data (Alg. 1 line 4)."""
+        """The run with one more episode in its data (Alg. 1 line 4).
+
+        Raises ValueError for arrays of other shapes, and, outside of jit, for numbers that are not finite and where
+        there is no room left.
+        """
+        check_episode(state, trajectory)
         return state._replace(data=dataset.add(state.data, trajectory, task.angles), trial=state.trial + 1)
 
     def learn(state: RunState, steps: int = fit_steps) -> tuple[RunState, FitInfo]:
         """Fit the model to the data (Alg. 1 line 5)."""
         learner, info = fit.run(trial_key(state.key, state.trial, FIT), state.model, state.data, steps)
         return state._replace(model=learner), info
+
+    def adapted(params: Params, data: Dataset) -> Params:
+        return params if policy.adapt is None else policy.adapt(params, data)
 
     def improve_policy(
         state: RunState, first: Array | int = 0, steps: int = search_steps
@@ -116,11 +173,44 @@ def experiment(
         earlier = search_steps * jnp.maximum(state.trial - max(1, explore_trials), 0) if search_goes_on else 0
         # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
         # that knows nothing is the better start.
-        fresh = policy.init(trial_key(state.key, state.trial, RESTART)) if search_restart else None
+        fresh = adapted(policy.init(trial_key(state.key, state.trial, RESTART)), state.data) if search_restart else None
+        untrained = (state.trial <= max(1, explore_trials)) & (first == 0)
+        given = optax.tree.where(untrained, adapted(state.policy.params, state.data), state.policy.params)
         learner, info = search.run(
-            key, state.policy, belief, first=first, earlier=earlier, steps=steps, rival=fresh, reset=search_reset
+            key,
+            state.policy._replace(params=given),
+            belief,
+            first=first,
+            earlier=earlier,
+            steps=steps,
+            rival=fresh,
+            reset=search_reset,
         )
         return state._replace(policy=learner), info
+
+    def succeed(state: RunState, incumbent: Params) -> tuple[RunState, Successor]:
+        """The policy that goes on after a search: its own, or the incumbent where that is expected to cost no more.
+
+        Both are imagined on the same fresh scenarios under the new model.
+        """
+        belief = dynamics.condition(state.model.params, state.data)
+        key = trial_key(state.key, state.trial, IMAGINE)
+        rolled, cost = imagine(key, state.policy.params, belief)
+        if not compare:
+            return state._replace(policy_trial=state.trial), Successor(
+                rolled, cost, jnp.full((), jnp.nan), jnp.bool_(True)
+            )
+        old_rolled, old_cost = imagine(key, incumbent, belief)
+        old = jnp.mean(old_cost)
+        replaced = (state.policy_trial == 0) | ~(old <= jnp.mean(cost))
+        rolled, cost, params = optax.tree.where(
+            replaced, (rolled, cost, state.policy.params), (old_rolled, old_cost, incumbent)
+        )
+        state = state._replace(
+            policy=state.policy._replace(params=params),
+            policy_trial=jnp.where(replaced, state.trial, state.policy_trial),
+        )
+        return state, Successor(rolled, cost, old, replaced)
 
     def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
         """Fit and search (Alg. 1 lines 5 and 6), unless the next episode is random too: then nothing, and NaN of it."""
@@ -131,7 +221,9 @@ def experiment(
 
     def learn_and_improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
         state, fitted = learn(state)
+        incumbent = state.policy.params
         state, searched = improve_policy(state)
+        state = succeed(state, incumbent)[0] if compare else state._replace(policy_trial=state.trial)
         return state, (fitted, searched)
 
     def look_ahead(state: RunState) -> tuple[Rollout, Array]:
@@ -154,15 +246,37 @@ def experiment(
         dynamics,
         policy,
         init,
-        one_episode,
+        run_episode,
         collect,
         absorb,
         learn,
         improve_policy,
+        succeed,
         improve,
         look_ahead,
         calibrate,
+        None if task.environment is None else drive,
     )
+
+
+def check_episode(state: RunState, trajectory: Trajectory) -> None:
+    """Raise ValueError for an episode that is not one of the task's, as far as can be told."""
+    (states, controls), horizon = (state.data.x.shape[1], state.data.u.shape[1]), len(trajectory.u)
+    shapes = dict(x=(horizon + 1, states), u=(horizon, controls), cost=(horizon,))
+    for name, shape in shapes.items():
+        if jnp.shape(getattr(trajectory, name)) != shape:
+            raise ValueError(f"an episode's {name} has shape {jnp.shape(getattr(trajectory, name))}; expected {shape}")
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state.data.size, trajectory))):
+        return
+    length = horizon if trajectory.length is None else int(trajectory.length)
+    for name, rows in (("x", trajectory.x[: length + 1]), ("u", trajectory.u[:length])):
+        for t, i in np.argwhere(~np.isfinite(np.asarray(rows)))[:1]:
+            raise ValueError(f"an episode's {name}[{t}, {i}] is {rows[t, i]}; expected finite numbers")
+    room = len(state.data.x) - int(state.data.size)
+    if length > room:
+        raise ValueError(
+            f"an episode of {length} rows does not fit: {room} are left; Config(trials=...) makes more room"
+        )
 
 
 def _unknown(like: jax.ShapeDtypeStruct) -> Array:
@@ -183,6 +297,8 @@ def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunStat
 def run(exp: Experiment, trials: int, episodes: int = 20) -> Callable[[Key], tuple[RunState, TrialInfo]]:
     """key -> (state, TrialInfo [T, ...]): a whole run as one function; jit(vmap(run(...)))(keys) is a study."""
 
+    if exp.drive is not None:
+        raise ValueError(f"task {exp.task.name} has an environment, which no program can hold; use pegasus_jax.train")
     room = jax.eval_shape(exp.init, jax.random.key(0)).data.x.shape[0] // exp.task.horizon
     if trials > room:
         raise ValueError(

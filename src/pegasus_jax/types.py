@@ -33,12 +33,12 @@ class Batch(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """One episode on a plant, as the controller saw it."""
+    """One episode on a plant, as the controller saw it. One that ended early has rows that say nothing behind it."""
 
     x: Array  # [H+1, D] observed state
     u: Array  # [H, U] control
     cost: Array  # [H] cost of the states 1..H, without sensor noise where the plant can tell
-    length: Array | None = None  # [] int32, how many control periods it lasted; the rows after them are not known
+    length: Array | None = None  # [] int32, the control periods that took place; None: all H
 
 
 class Prediction(NamedTuple):
@@ -116,14 +116,16 @@ class Policy(NamedTuple):
     apply: Callable[[Params, Params, Array], Array]  # (params, noise or None: the mean policy, x [D]) -> u [U]
     # (params, mean [F], cov of the encoded state) -> gaussian.Image of the control; None: not known
     moments: Callable[[Params, Array, Array], Any] | None = None
+    # (fresh params, data) -> params that take the data's large entries in their own units; None: not needed
+    adapt: Callable[[Params, Dataset], Params] | None = None
 
 
 class Task(NamedTuple):
     """What is to be learned: a plant's interface, a cost, and where episodes start."""
 
     name: str
-    # reset(key) -> state; step(state, u [U]) -> state; observe(state) -> x [D]. None: somebody else, a robot or a
-    # Gymnasium environment, supplies the episodes.
+    # reset(key) -> state; step(state, u [U]) -> state; observe(state) -> x [D]. None: `environment`, or somebody else,
+    # supplies the episodes.
     plant: Any
     cost: Callable[[Array], Array]  # x [D] -> scalar in [0, 1]
     angles: tuple[int, ...]  # the dimensions of x that are angles [rad]
@@ -143,6 +145,17 @@ class Task(NamedTuple):
     expected_cost: Callable[[Array, Array], Array] | None = None
     # A factor -> (cost, expected_cost) of the same error with that many times the width. None: the cost has no width.
     widened: Callable[[Array], tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]] | None = None
+    # reset(seed) -> x [D]; step(u [U]) -> (x [D], the control sent [U], how it ended or ""); close(). A plant outside
+    # of JAX, of which there is one: a Gymnasium environment, maybe a robot.
+    environment: Any = None
+    # x [D] -> probability that an episode ends there; None: it ends at the horizon, or where the environment says so
+    stop: Callable[[Array], Array] | None = None
+    stop_cost: float = 1.0  # of each control period that an early end leaves out
+
+    @property
+    def may_end(self) -> bool:
+        """Whether an episode may be shorter than the horizon."""
+        return self.environment is not None or self.stop is not None
 
 
 class Learner(NamedTuple):
@@ -175,6 +188,24 @@ class RunState(NamedTuple):
     model: Learner
     policy: Learner
     trial: Array  # [] int32, episodes absorbed so far
+    policy_trial: Array  # [] int32, the trial after which this policy was learned; 0: it has learned nothing yet
+
+
+class Successor(NamedTuple):
+    """What a policy is expected to do on fresh scenarios, and what the one before it would have."""
+
+    rollout: Rollout  # of the policy that goes on
+    cost: Array  # [H, K] of that rollout
+    incumbent: Array  # [] expected cost a step of the policy before the search; NaN where it was not asked for
+    replaced: Array  # [] whether the search's policy took its place
+
+
+class Episode(NamedTuple):
+    """An episode on an environment, and why it is over."""
+
+    trajectory: Trajectory
+    ended: str = "horizon"  # or terminated, truncated; error, interrupted
+    error: BaseException | None = None  # what it was raised
 
 
 class Experiment(NamedTuple):
@@ -189,6 +220,11 @@ class Experiment(NamedTuple):
     absorb: Callable[[RunState, Trajectory], RunState]  # Alg. 1 line 4
     fit: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 5
     search: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 6
-    improve: Callable[[RunState], tuple[RunState, Any]]  # search after fit
+    # (state, policy parameters before the search) -> (state with the policy that goes on, Successor)
+    succeed: Callable[[RunState, Params], tuple[RunState, Successor]]
+    improve: Callable[[RunState], tuple[RunState, Any]]  # fit, search, succeed
     imagine: Callable[[RunState], tuple[Rollout, Array]]  # fresh scenarios -> (rollout, cost [H, K])
     calibrate: Callable[[RunState, Trajectory], Array]  # of the model, on an episode not yet absorbed -> calibration
+    # `episode` on the task's environment, which says how it ended and keeps the rows of one that failed; None: the
+    # plant is in JAX
+    drive: Callable[[Key, Params, bool], Episode] | None = None

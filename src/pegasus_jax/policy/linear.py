@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from pegasus_jax.gaussian import Image, Map, affine, chain
-from pegasus_jax.types import Array, Key, Params, Policy
+from pegasus_jax.policy.scaled import of_data
+from pegasus_jax.types import Array, Dataset, Key, Params, Policy
 
 
 def linear(
@@ -32,8 +33,13 @@ def linear(
         del noise
         return saturate(params["weights"] @ encode(x) + params["bias"])
 
+    def adapt(params: Params, data: Dataset) -> Params:
+        mean, scale = of_data(encode(data.x), data.size)
+        weights = params["weights"] / scale
+        return {"weights": weights, "bias": params["bias"] - weights @ mean}
+
     def moments(params: Params, mean: Array, cov: Array) -> Image:
         assert saturate_moments is not None
         return chain(partial(affine, matrix=params["weights"], offset=params["bias"]), saturate_moments)(mean, cov)
 
-    return Policy(init, lambda key: (), apply, moments if saturate_moments else None)
+    return Policy(init, lambda key: (), apply, moments if saturate_moments else None, adapt)

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from pegasus_jax.network import MLP
-from pegasus_jax.types import Array, Dropout, Key, Params, Policy
+from pegasus_jax.policy.scaled import of_data, scaled, unscaled
+from pegasus_jax.types import Array, Dataset, Dropout, Key, Params, Policy
 
 
 def mlp(
@@ -24,6 +25,7 @@ def mlp(
 ) -> Policy:
     """u = saturate(network(encode(x) * input_scale)); noise is on each hidden layer's output (docs/reference.md 5.1).
 
+    What the data have large is standardised on its way in, see `scaled`.
     `output_scale` multiplies the last layer's initial weights: how far from the middle of the limits, and how near to
     saturation, a policy starts.
     """
@@ -34,7 +36,11 @@ def mlp(
         net: Any = network.init(net_key, jnp.zeros(features), [None] * (len(hidden) + 1))
         last = f"layer_{len(hidden)}"
         net["params"][last]["kernel"] = net["params"][last]["kernel"] * output_scale
-        return {"network": net, "noise": tuple(dropout.init(k, w) for k, w in zip(keys, hidden, strict=True))}
+        noise = tuple(dropout.init(k, w) for k, w in zip(keys, hidden, strict=True))
+        return {"network": net, "noise": noise, "input": unscaled(features)}
+
+    def adapt(params: Params, data: Dataset) -> Params:
+        return params | {"input": of_data(encode(data.x) * input_scale, data.size)}
 
     def sample(key: Key) -> tuple[Array, ...]:
         keys = jax.random.split(key, len(hidden))
@@ -46,7 +52,8 @@ def mlp(
             masks = [dropout.retain(p) for p in params["noise"]]
         else:
             masks = [dropout.mask(p, z) for p, z in zip(params["noise"], noise, strict=True)]
-        out: Any = network.apply(params["network"], encode(x) * input_scale, [None, *masks])
+        inputs = scaled(params["input"], encode(x) * input_scale)
+        out: Any = network.apply(params["network"], inputs, [None, *masks])
         return saturate(out)
 
-    return Policy(init, sample, apply)
+    return Policy(init, sample, apply, adapt=adapt)

@@ -7,7 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from pegasus_jax.gaussian import Image, Map, chain, rbf_moments
-from pegasus_jax.types import Array, Key, Params, Policy
+from pegasus_jax.policy.scaled import of_data
+from pegasus_jax.types import Array, Dataset, Key, Params, Policy
 
 # Variance of the targets' noise, for a signal of variance 1; both fixed. The originals' .01 is a standard deviation
 # (docs/reference.md 5.1), which makes weights of thousands that cancel: more than float32 can hold, and no better.
@@ -47,6 +48,11 @@ def rbf(
         lengthscales, beta = regress(params)
         return saturate(jnp.sum(kernel(encode(x), params["centres"], lengthscales) * beta, -1))
 
+    def adapt(params: Params, data: Dataset) -> Params:
+        scale = of_data(encode(data.x), data.size).scale
+        before = jnp.log(jnp.expm1(scale))  # a length scale of the data's own size, before softplus
+        return params | {"lengthscales": jnp.where(scale == 1, params["lengthscales"], before)}
+
     def moments(params: Params, mean: Array, cov: Array) -> Image:
         lengthscales, beta = regress(params)
         mixture = partial(
@@ -60,7 +66,7 @@ def rbf(
         assert saturate_moments is not None
         return chain(mixture, saturate_moments)(mean, cov)
 
-    return Policy(init, lambda key: (), apply, moments if saturate_moments else None)
+    return Policy(init, lambda key: (), apply, moments if saturate_moments else None, adapt)
 
 
 def regress(params: Params) -> tuple[Array, Array]:

@@ -3,6 +3,7 @@
 import os
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import imageio.v2 as imageio
@@ -42,24 +43,23 @@ def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.LAS
     if not hasattr(task.plant, "glide"):
         raise RunError(f"{run} learned {task.name}; only plants in JAX can be filmed")
     perform = jax.jit(partial(performance, task=task, policy=experiment.policy, mean=mean))
-    path, beside = run / "play.mp4", run / ".play.mp4"
-    writer: Any = None
-    try:
-        for number, key in enumerate(jax.random.split(jax.random.key(seed), episodes), start=1):
-            trajectory, states = perform(key, state.policy.params)
-            title = f"{task.name}, trial {int(state.trial)}, episode {number} of {episodes}"
-            pictures = _pictures(task, states)
-            if writer is None:
-                rate = round(len(pictures) / (task.horizon * task.dt))
-                writer = imageio.get_writer(beside, fps=rate, macro_block_size=16)
-            for picture in composed(pictures, strip(trajectory, task, title)):
-                writer.append_data(picture)
-        writer.close()
+    path, writer = run / "play.mp4", None
+    # A folder of its own beside: ffmpeg opens no file that was there, and what was at `path`, a link too, is replaced.
+    with TemporaryDirectory(dir=run, prefix=".play.") as folder:
+        beside = Path(folder) / path.name
+        try:
+            for number, key in enumerate(jax.random.split(jax.random.key(seed), episodes), start=1):
+                trajectory, states = perform(key, state.policy.params)
+                title = f"{task.name}, trial {int(state.trial)}, episode {number} of {episodes}"
+                drawn = pictures(task, states)
+                if writer is None:
+                    writer = _writer(beside, rate=round(len(drawn) / (task.horizon * task.dt)))
+                for picture in composed(drawn, strip(trajectory, task, title)):
+                    writer.append_data(picture)
+        finally:
+            if writer is not None:
+                writer.close()
         os.replace(beside, path)
-    finally:
-        if writer is not None:
-            writer.close()
-        beside.unlink(missing_ok=True)
     return path
 
 
@@ -114,10 +114,17 @@ def composed(pictures: list[np.ndarray], drawn: Strip) -> list[np.ndarray]:
     return whole
 
 
-def _pictures(task: Task, states: Any) -> list[np.ndarray]:
-    """Pictures of states [H, n, ...]. Raises RunError where nothing can be drawn."""
-    flat = jax.tree.map(lambda leaf: np.asarray(leaf).reshape(-1, *leaf.shape[2:]), states)
+def pictures(task: Task, states: Any, width: int = WIDTH, height: int = HEIGHT) -> list[np.ndarray]:
+    """Pictures [height, width, 3] of states [H, n, ...]. Raises RunError where nothing can be drawn."""
+
+    def flat(leaf: Any) -> np.ndarray:  # sizes are named, because -1 means nothing for a leaf without entries
+        return np.asarray(leaf).reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])
+
     try:
-        return tasks.pictures(task, flat, WIDTH, HEIGHT)
+        return tasks.pictures(task, jax.tree.map(flat, states), width, height)
     except RuntimeError as error:
         raise RunError(str(error).splitlines()[0]) from error
+
+
+def _writer(path: Path, rate: int) -> Any:
+    return imageio.get_writer(path, fps=rate, macro_block_size=16)

@@ -69,7 +69,7 @@ def trajectories(run: Path, trial: int, fan: dict[str, np.ndarray], task: Task, 
     figure, axes = plt.subplots(-(-len(names) // columns), columns, figsize=(11, 2.4 * -(-len(names) // columns)))
     flat: list[Axes] = list(np.ravel(axes))
     imagined = [*np.moveaxis(fan["x"], -1, 0), *np.moveaxis(fan["u"], -1, 0), fan["cost"]]
-    actual = None if real is None else [*real.x.T, *real.u.T, real.cost]
+    actual = None if real is None else [*real.trajectory.x.T, *real.trajectory.u.T, real.trajectory.cost]
     for i, (axis, name) in enumerate(zip(flat, names, strict=False)):
         first = 1 if name == "cost" else 0
         _fan(axis, (first + np.arange(imagined[i].shape[0])) * task.dt, imagined[i])

@@ -1,0 +1,188 @@
+"""A Gymnasium environment with continuous controls as a plant, used as it was made: its wrappers are its owner's.
+
+It may be a robot, so it is opened once a process, never reset without need, and closed when it is no longer needed.
+"""
+
+import atexit
+import json
+from collections.abc import Callable, Sequence
+from functools import cache
+from typing import Any, NamedTuple
+
+import gymnasium
+import numpy as np
+
+from pegasus_envs.plant import filled
+
+RESETS = 100  # from which the distribution of starts is estimated where it is not given
+
+
+class EnvSpec(NamedTuple):
+    """What has to be known of an environment before its first episode."""
+
+    control_low: np.ndarray
+    control_high: np.ndarray
+    dt: float
+    """control period [s]; 1 when the environment tells neither `dt` nor frames a second"""
+    horizon: int
+    """control periods of an episode; the environment's own limit, or 100"""
+    start_mean: np.ndarray
+    start_std: np.ndarray
+
+
+class EnvPlant(NamedTuple):
+    """An environment as a plant outside of JAX. There is one of it, and only the main thread calls it."""
+
+    reset: Callable[[int], np.ndarray]
+    """seed -> x [D]"""
+    step: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, str]]
+    """control [U] -> (x [D], the control as it was sent [U], "terminated", "truncated" or "")"""
+    close: Callable[[], None]
+
+
+_opened: dict[tuple[str, tuple[str, ...]], gymnasium.Env] = {}
+
+
+def make_env(name: str, arguments: tuple[str, ...] = ()) -> gymnasium.Env:
+    """The environment that Gymnasium knows as `name`, opened once.
+
+    `arguments` are its constructor's, as `port=/dev/ttyACM0`: JSON on the right, or else text. Raises what Gymnasium or
+    the constructor raises.
+    """
+    if (name, arguments) not in _opened:
+        pairs = (argument.partition("=") for argument in arguments)
+        given: Any = {key: _value(text) for key, _, text in pairs}
+        _opened[name, arguments] = gymnasium.make(name, disable_env_checker=True, **given)
+    return _opened[name, arguments]
+
+
+def close_env(name: str, arguments: tuple[str, ...] = ()) -> None:
+    """Close the environment if it is open; the next use opens it again."""
+    env = _opened.pop((name, arguments), None)
+    if env is not None:
+        starts.cache_clear()
+        env.close()
+
+
+@atexit.register
+def close_environments() -> None:
+    """Close every environment that is open."""
+    for name, arguments in tuple(_opened):
+        close_env(name, arguments)
+
+
+@cache
+def starts(name: str, arguments: tuple[str, ...] = (), resets: int = RESETS) -> np.ndarray:
+    """Where as many resets take an environment [resets, D]."""
+    env = make_env(name, arguments)
+    space: Any = env.observation_space
+    return np.stack([observed(first(env.reset(seed=seed)), space.shape[0]) for seed in range(resets)])
+
+
+def env_spec(
+    name: str,
+    arguments: tuple[str, ...] = (),
+    *,
+    control_low: Sequence[float] = (),
+    control_high: Sequence[float] = (),
+    dt: float | None = None,
+    horizon: int | None = None,
+    start_mean: Sequence[float] = (),
+    start_std: Sequence[float] = (),
+) -> EnvSpec:
+    """What is given of an environment, and the rest from itself; without a `start_mean` it is reset 100 times.
+
+    Raises ValueError, in one line, when its controls or observations are not vectors of numbers, or cannot be as given.
+    """
+    env = make_env(name, arguments)
+    controls, seen = (getattr(env, space, None) for space in ("action_space", "observation_space"))
+    for space, what in ((controls, "action_space"), (seen, "observation_space")):
+        if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
+            raise ValueError(f"its {what} is {space}, not a Box of one dimension")
+    assert isinstance(controls, gymnasium.spaces.Box)
+    assert isinstance(seen, gymnasium.spaces.Box)
+    low = filled("control_low", control_low, controls.shape[0], controls.low)
+    high = filled("control_high", control_high, controls.shape[0], controls.high)
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        raise ValueError(f"its controls have no limits: {controls}; give control_low= and control_high=")
+    for least, greatest, bottom, top in zip(low, high, controls.low, controls.high, strict=True):
+        if not bottom <= least < greatest <= top:
+            raise ValueError(
+                f"controls from {least:g} to {greatest:g} are not among its own, from {bottom:g} to {top:g}"
+            )
+    size, rest = seen.shape[0], np.zeros(seen.shape)
+    mean, std = filled("start_mean", start_mean, size, rest, each=True), filled("start_std", start_std, size, rest)
+    if not len(start_mean):
+        places = starts(name, arguments)
+        mean, std = places.mean(0), places.std(0)
+    limit = env.spec.max_episode_steps if env.spec else None
+    return EnvSpec(low, high, dt or period(env), horizon or limit or 100, mean, std)
+
+
+def period(env: Any) -> float:
+    """The environment's control period [s]: its `dt`, else its frames a second. Raises ValueError for another `dt`."""
+    try:
+        dt = env.get_wrapper_attr("dt")
+    except AttributeError:
+        frames = (env.metadata or {}).get("render_fps")
+        return 1.0 / frames if frames else 1.0
+    if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not 0 < dt < np.inf:
+        raise ValueError(f"its dt is {dt!r}, not a number of seconds; give dt=")
+    return float(dt)
+
+
+def env_plant(name: str, arguments: tuple[str, ...], states: int) -> EnvPlant:
+    """The environment of so many observations, opened when its first episode begins.
+
+    An observation that is not finite, or not of that length, is refused at once: no control follows from it, and no
+    data. Controls are the environment's own copy, of its action space's dtype and limits; whole numbers are rounded.
+    """
+
+    def reset(seed: int) -> np.ndarray:
+        return observed(first(make_env(name, arguments).reset(seed=seed)), states)
+
+    def step(control: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
+        env = make_env(name, arguments)
+        space: Any = env.action_space
+        whole = np.issubdtype(space.dtype, np.integer)
+        sent = np.clip(np.rint(control) if whole else control, space.low, space.high).astype(space.dtype)
+        answer = env.step(sent.copy())
+        if not isinstance(answer, tuple) or len(answer) != 5:
+            raise ValueError(
+                f"its step returned {_shape(answer)}; expected (observation, reward, terminated, truncated, info)"
+            )
+        seen, _, terminated, truncated, _ = answer
+        return observed(seen, states), sent, "terminated" if terminated else "truncated" if truncated else ""
+
+    return EnvPlant(reset, step, lambda: close_env(name, arguments))
+
+
+def first(answer: Any) -> Any:
+    """The observation of a reset's answer. Raises ValueError for that of an old Gym environment."""
+    if not isinstance(answer, tuple) or len(answer) != 2:
+        raise ValueError(f"its reset returned {_shape(answer)}; expected (observation, info)")
+    return answer[0]
+
+
+def observed(x: Any, states: int) -> np.ndarray:
+    """A copy of an observation [D], in single precision. Raises ValueError where it is not one, or not finite."""
+    try:
+        x = np.array(x, np.float32)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"it observed {type(x).__name__}; expected {states} numbers") from error
+    if x.shape != (states,):
+        raise ValueError(f"it observed an array of shape {x.shape}; expected ({states},)")
+    for entry in np.flatnonzero(~np.isfinite(x)):
+        raise ValueError(f"entry {entry} of its observation is {x[entry]}")
+    return x
+
+
+def _value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
+def _shape(answer: Any) -> str:
+    return f"{len(answer)} values" if isinstance(answer, tuple) else type(answer).__name__

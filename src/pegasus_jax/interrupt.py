@@ -1,0 +1,118 @@
+"""Signals that ask a command to stop: a robot is let go first, and the process ends with 128 + the signal's number."""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable
+from types import FrameType
+from typing import Any
+
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+
+class Interrupted(KeyboardInterrupt):
+    """A signal asked to stop; its argument is the signal's number."""
+
+
+class _State:
+    """Signals are the process's own, and so is what is known of them."""
+
+    listening = False
+    closing = False
+    asked: list[int] = []  # noqa: RUF012
+    cleanups: list[Callable[[], None]] = []  # noqa: RUF012
+    others: dict[int, Any] = {}  # noqa: RUF012
+
+
+def listen() -> None:
+    """From now on a signal raises `Interrupted` in the main thread; a second one cleans up and ends the process."""
+    _State.listening, _State.closing = True, False
+    _State.asked.clear()
+    _State.others.clear()
+    for number in SIGNALS:
+        if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
+            signal.signal(number, _handle)
+
+
+def reclaim() -> None:
+    """Answer the signals again after a user's code took them; its handlers are called first."""
+    for number in SIGNALS if _State.listening else ():
+        handler = signal.getsignal(number)
+        if handler not in (_handle, signal.SIG_IGN):
+            _State.others[number] = handler
+            signal.signal(number, _handle)
+
+
+def check() -> None:
+    """Raise `Interrupted` if a signal asked to stop, also where somebody's `except` swallowed it."""
+    if _State.asked:
+        raise Interrupted(_State.asked[0])
+
+
+def before_end(cleanup: Callable[[], None]) -> None:
+    """Call `cleanup` when the command ends, whatever ends it."""
+    _State.cleanups.append(cleanup)
+
+
+def clean_up() -> None:
+    """Do now, once, what was to be done before the end."""
+    while _State.cleanups:
+        let_go(_State.cleanups.pop())
+
+
+def let_go(close: Callable[[], None]) -> None:
+    """Call a robot's `close` to its end: signals wait for it, a third one does not. What it raises is said."""
+    _State.closing = True
+    try:
+        close()
+    except Exception as error:
+        print(f"pegasus: closing the environment failed, {type(error).__name__}: {error}", file=sys.stderr)
+    finally:
+        _State.closing = False
+
+
+def status() -> int:
+    """The exit status of a command that was asked to stop: 130 after Ctrl-C."""
+    return 128 + (_State.asked[0] if _State.asked else int(signal.SIGINT))
+
+
+def end(code: int) -> None:
+    """End the process with this status: what still compiles or computes is waited for by a success only."""
+    others = [thread for thread in threading.enumerate() if thread.daemon]
+    if code == 0:
+        for thread in others:
+            thread.join()
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):  # nobody reads it any more
+            stream.flush()
+    if code >= 128 or (code and any(thread.is_alive() for thread in others)):
+        os._exit(code)  # the compiler's threads cannot be stopped, and other libraries' would be surprised
+    sys.exit(code)
+
+
+def forget_input() -> None:
+    """Throw away what was typed before a question is asked: it would answer "Is the robot at rest?"."""
+    try:
+        import termios
+
+        termios.tcflush(sys.stdin, termios.TCIFLUSH)
+    except Exception:  # no terminal, or a system without them
+        return
+
+
+def _handle(number: int, frame: FrameType | None) -> None:
+    _State.asked.append(number)
+    other = _State.others.get(number)
+    if callable(other) and other is not signal.default_int_handler:
+        try:
+            other(number, frame)
+        except Exception as error:
+            print(f"pegasus: a signal handler of the environment failed: {error}", file=sys.stderr)
+    if _State.closing and len(_State.asked) < 3:
+        return
+    if len(_State.asked) == 1:
+        raise Interrupted(number)
+    clean_up()
+    os._exit(status())

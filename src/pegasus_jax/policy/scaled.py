@@ -1,0 +1,51 @@
+"""A controller's inputs, standardised where the data have them so large that they would saturate it."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.types import Array, Params
+
+LARGE = 20.0  # root mean square; entries of our own plants reach 9, and are left as they are
+CONSTANT = 1e-5  # of its size: what an entry varies by rounding
+
+
+class Input(NamedTuple):
+    """How features become inputs: (features - mean) / scale. It is kept with the parameters, and not learned."""
+
+    mean: Array  # [F]
+    scale: Array  # [F]
+
+
+def unscaled(features: int) -> Input:
+    """The input that leaves so many features as they are."""
+    return Input(jnp.zeros(features), jnp.ones(features))
+
+
+def of_data(features: Array, size: Array) -> Input:
+    """The input for data whose first `size` rows of features [N, F] are in use.
+
+    A feature whose root mean square is more than LARGE has its mean subtracted and is divided by its standard
+    deviation, or by 1 where it is constant; the others are left as they are, to the last bit.
+    """
+    used = (jnp.arange(features.shape[0]) < size)[:, None]
+    count = jnp.maximum(size, 1).astype(features.dtype)
+    rows = jnp.where(used, features, 0)
+    mean = jnp.sum(rows, 0) / count
+    size_of = jnp.sqrt(jnp.sum(rows**2, 0) / count)
+    spread = jnp.sqrt(jnp.sum(jnp.where(used, rows - mean, 0) ** 2, 0) / count)
+    large = size_of > LARGE
+    scale = jnp.where(spread > CONSTANT * size_of, spread, 1)
+    return Input(jnp.where(large, mean, 0), jnp.where(large, scale, 1))
+
+
+def scaled(given: Input, features: Array) -> Array:
+    """The inputs [..., F] of features [..., F]; no gradient reaches the scaling."""
+    mean, scale = jax.lax.stop_gradient(given)
+    return (features - mean) / scale
+
+
+def inherited(fresh: Params, given: Params) -> Params:
+    """Fresh parameters with the input of the given ones, where they have one."""
+    return fresh | {"input": given["input"]} if isinstance(given, dict) and "input" in given else fresh

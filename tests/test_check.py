@@ -1,0 +1,157 @@
+"""pegasus-check: what would go wrong is said before anything moves, and pegasus-train says it first too."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pegasus_jax import check
+from pegasus_jax.checks import SettingError
+from pegasus_jax.cost_check import Facts
+
+ROBOT = """
+import gymnasium, numpy as np, jax.numpy as jnp
+
+def cost(x): return 1 - jnp.exp(-2 * (1 - jnp.cos(x[0])))
+def big(x): return 10 * (1 - jnp.cos(x[0]))
+def reward(x): return -(1 - jnp.cos(x[0])) / 2
+def python(x): return 0.0 if x[0] > 0 else 1.0
+def square(x): return 1 - jnp.exp(-x ** 2)
+
+def note(what):
+    with open("asked.log", "a") as file:
+        print(what, file=file)
+
+class Arm(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,), np.float32)
+    dt = 0.05
+    def reset(self, *, seed=None, options=None):
+        note("reset")
+        super().reset(seed=seed)
+        self.x = np.array([np.pi, 0.0]) + self.np_random.normal(0, 0.05, 2)
+        return self.seen(), {}
+    def seen(self):
+        return self.x.copy()
+    def step(self, control):
+        note("step")
+        self.x[1] += 0.1 * float(control[0])
+        return self.seen(), 0.0, False, False, {}
+    def close(self):
+        note("close")
+
+class Degrees(Arm):
+    def seen(self):
+        return np.rad2deg(self.x)
+
+class Fails(Arm):
+    def reset(self, **options):
+        raise OSError("no motor answers")
+
+class Twice(Arm):
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (4,), np.float64)
+    def seen(self):
+        return np.array([*self.x, 0.5 * np.cos(self.x[0]), 0.7])
+
+for kind in (Arm, Degrees, Fails, Twice):
+    gymnasium.register(f"{kind.__name__}-v0", kind)
+"""
+WORDS = ["task=gym", "angles=[0]", "horizon=5", "evaluation=0"]
+TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=1"]
+
+
+def call(name: str, *words: str, cwd: Path) -> tuple[int, str, list[str]]:
+    (cwd / "robot.py").write_text(ROBOT)
+    program = [sys.executable, "-P", "-c", f"from pegasus_jax.cli import {name}; {name}()"]
+    done = subprocess.run([*program, *WORDS, *words], cwd=cwd, capture_output=True, text=True, check=False)
+    log = cwd / "asked.log"
+    return done.returncode, done.stdout + done.stderr, log.read_text().split() if log.exists() else []
+
+
+def test_it_says_what_a_robot_is_like_and_moves_nothing(tmp_path: Path) -> None:
+    code, said, asked = call("check", "env=robot:Arm-v0", "cost=robot:big", "start_mean=[3.14,0]", cwd=tmp_path)
+    assert (code, asked) == (0, ["reset", "close"]), said
+    for part in ("OrderEnforcing of Arm", "u0 from -2 to 2", "5 periods of 0.05 s", "x0, x1", "more than 1: success"):
+        assert part in said
+    assert [path.name for path in tmp_path.iterdir() if path.name not in ("robot.py", "__pycache__")] == ["asked.log"]
+
+
+@pytest.mark.parametrize("command", ["check", "train"])
+@pytest.mark.parametrize(
+    ("words", "says", "asks"),
+    [
+        (["env=robot:Arm-v0", "cost=robot:reward"], "is it a reward?", ["close"]),
+        (["env=robot:Arm-v0", "cost=robot:python"], "is not a JAX function", ["close"]),
+        (["env=robot:Degrees-v0", "cost=robot:cost"], "x0 is 18", ["reset", "close"]),
+        (["env=robot:Fails-v0", "cost=robot:cost"], "OSError: no motor answers (robot.py:", ["close"]),
+    ],
+)
+def test_a_mistake_is_one_line_and_moves_nothing(
+    command: str, words: list[str], says: str, asks: list[str], tmp_path: Path
+) -> None:
+    code, said, asked = call(command, *words, "start_mean=[3.14,0]", *TINY, "out=run", cwd=tmp_path)
+    lines = [line for line in said.splitlines() if not line.startswith(("learning ", "running on "))]
+    assert (code, len(lines)) == (2, 1), said
+    assert says in said
+    assert asked == asks
+    assert not (tmp_path / "run").exists()
+
+
+def test_training_notes_what_checking_does(tmp_path: Path) -> None:
+    words = ["env=robot:Twice-v0", "cost=robot:big", *TINY, "explore.trials=2"]
+    code, said, _ = call("train", *words, "out=run", cwd=tmp_path)
+    assert code == 0, said
+    notes = [line for line in said.splitlines() if line.startswith("note: ")]
+    assert len(notes) == 3, said
+    for part in ("more than 1: success", "x2 follows from cos(x0)", "the same: x3"):
+        assert part in "\n".join(notes)
+
+
+def test_a_mujoco_file_is_checked_without_a_robot(tmp_path: Path) -> None:
+    (tmp_path / "arm.xml").write_text(
+        '<mujoco><worldbody><body><joint name="j" type="hinge" axis="0 1 0" damping=".05"/><geom type="capsule"'
+        ' size=".03" fromto="0 0 0 0 0 -.5"/></body></worldbody><actuator><motor joint="j" ctrlrange="-2 2"/>'
+        "</actuator></mujoco>"
+    )
+    words = ["task=mjcf", "mjcf=arm.xml", "cost=robot:big", "dt=0.04", "start_std=[0.1]"]
+    code, said, asked = call("check", *words, cwd=tmp_path)
+    assert (code, asked) == (0, []), said
+    for part in ("j [rad], j' [rad/s]", "more than 1: success"):
+        assert part in said
+    code, said, _ = call("check", *words, "start_mean=[180,0]", cwd=tmp_path)
+    assert (code, said.count("\n")) == (2, 1), said
+    assert "degrees?" in said
+
+
+def facts(start: float) -> Facts:
+    wide = np.full(2, np.inf)
+    return Facts(np.array([start, 0.0]), np.zeros(2), (0,), -wide, wide, np.zeros((0, 2)))
+
+
+def test_angles_of_more_than_two_turns_are_degrees() -> None:
+    at = lambda x: np.array([[x, 500.0]])  # noqa: E731
+    assert check.plausible(at(-6.0), facts(3.14)) == []
+    assert "more than a turn" in check.plausible(at(-7.0), facts(3.14))[0]
+    for reading, start in ((90.0, 0.0), (0.0, -180.0)):
+        with pytest.raises(SettingError, match=r"degrees\? Return np.deg2rad"):
+            check.plausible(at(reading), facts(start))
+
+
+def test_readings_that_follow_from_others_are_named() -> None:
+    draws = np.random.default_rng(0)
+    a, b = draws.normal(size=(2, 20))
+    free = np.column_stack([a, b, a * b])
+    assert check.alike(free) == []
+    assert check.alike(free[:1]) == []
+    (twice,) = check.alike(np.column_stack([a, b, 57.3 * a + 2]))
+    assert twice.startswith("x2 follows from x0 in")
+    (both,) = check.alike(np.column_stack([a, b, 3 * a - b]))
+    assert both.startswith("x2 follows from x0, x1 in")
+    (height,) = check.alike(np.column_stack([a, b, 0.5 * np.sin(a)]), angles=(0,))
+    assert height.startswith("x2 follows from sin(x0) in")
+    (still,) = check.alike(np.column_stack([a, np.full(20, 1e4), np.zeros(20)]))
+    assert "the same: x1, x2;" in still

@@ -1,0 +1,305 @@
+"""task=gym: environments that were not written for us become tasks by a line on the command line and a cost."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, ClassVar
+
+import gymnasium
+import jax
+import numpy as np
+import pytest
+
+from pegasus_envs.gym_plant import env_plant, env_spec, make_env, period
+from pegasus_jax import episode, interrupt, record, settings
+from pegasus_jax.build import compose
+from pegasus_jax.types import Task
+from probes import cart, tiny
+
+TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
+COSTS = """
+import jax.numpy as jnp
+
+def upright(x):  # Pendulum-v1: cos, sin, rate
+    return (1 - x[0]) / 2
+
+def balanced(x):  # InvertedDoublePendulum-v5: cart, sin x2, cos x2, rates, force
+    return 1 - jnp.exp(-(x[1] ** 2 + x[2] ** 2 + (x[3] - 1) ** 2 + (x[4] - 1) ** 2))
+"""
+
+
+def train(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    (cwd / "costs.py").write_text(COSTS)
+    program = [sys.executable, "-P", "-c", "from pegasus_jax.cli import train; train()", "task=gym"]
+    return subprocess.run([*program, *map(str, words)], cwd=cwd, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("env", "cost", "states", "limit"),
+    [("Pendulum-v1", "costs:upright", 3, 2.0), ("InvertedDoublePendulum-v5", "costs:balanced", 9, 1.0)],
+)
+def test_an_environment_not_written_for_us(env: str, cost: str, states: int, limit: float, tmp_path: Path) -> None:
+    """What the run stored is what Gymnasium says: the same controls from the same start give the same observations."""
+    done = train(f"env={env}", f"cost={cost}", "horizon=8", *TINY, "out=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    rows = record.trials(tmp_path / "run")
+    assert [row["random"] for row in rows] == [True, False]
+    assert all(np.isfinite(row["mean_cost"]) for row in rows)
+    for trial in (1, 2):
+        ran = record.load_episode(tmp_path / "run", trial)
+        assert ran is not None
+        steps = len(ran.trajectory.u)  # the double pendulum falls before it is over
+        assert ran.trajectory.x.shape == (steps + 1, states)
+        assert (steps == 8) == (ran.ended == "horizon")
+        assert np.all(np.abs(ran.trajectory.u) <= limit)
+    assert settings.load(tmp_path / "run" / "config.yaml").env == env
+
+
+def task_of(env: str, states: int, horizon: int = 9, low: float = -2.0, high: float = 2.0) -> Task:
+    """A task on a registered environment of one control, whose cost is that of its first observation."""
+    return cart(horizon)._replace(
+        name=env,
+        plant=None,
+        environment=env_plant(env, (), states),
+        cost=lambda x: x[0] ** 2,
+        state_names=tuple(f"x{i}" for i in range(states)),
+        control_low=np.array([low]),
+        control_high=np.array([high]),
+    )
+
+
+def test_an_episode_is_what_gymnasium_says() -> None:
+    controls = np.linspace(-2, 2, 9, dtype=np.float32)[:, None]
+    ran = episode.drive(4, lambda t, x: controls[t], task_of("Pendulum-v1", 3))
+    assert (ran.ended, ran.error) == ("horizon", None)
+    env = gymnasium.make("Pendulum-v1")
+    x, _ = env.reset(seed=4)
+    np.testing.assert_array_equal(ran.trajectory.x, [x, *(env.step(u)[0] for u in controls)])
+    np.testing.assert_array_equal(ran.trajectory.u, controls)
+
+
+class Base(gymnasium.Env):
+    """Counts its steps, and remembers what was sent."""
+
+    action_space: gymnasium.Space = gymnasium.spaces.Box(-1, 1, (1,))
+    observation_space: gymnasium.Space = gymnasium.spaces.Box(-np.inf, np.inf, (1,))
+    sent: ClassVar[list] = []
+    closed = 0
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+        self.count = 0
+        type(self).sent.clear()
+        return np.zeros(1), {}
+
+    def step(self, action: Any) -> Any:
+        self.count += 1
+        self.sent.append(np.array(action))
+        return np.full(1, float(self.count)), 0.0, False, False, {}
+
+    def close(self) -> None:
+        type(self).closed += 1
+
+
+class Terminates(Base):
+    def step(self, action: Any) -> Any:
+        assert self.count < 3, "stepped after its end"
+        x, cost, *_ = super().step(action)
+        return x, cost, self.count == 3, False, {}
+
+
+class Truncates(Terminates):
+    def step(self, action: Any) -> Any:
+        x, cost, over, _, info = super().step(action)
+        return x, cost, False, over, info
+
+
+class Breaks(Base):
+    def step(self, action: Any) -> Any:
+        if self.count == 3:
+            raise OSError("the limit switch opened")
+        return super().step(action)
+
+
+class Swallows(Base):
+    """A signal comes in the third step, and a bare except takes it."""
+
+    def step(self, action: Any) -> Any:
+        try:
+            if self.count == 2:
+                signal.raise_signal(signal.SIGINT)
+        except:  # noqa: E722
+            pass
+        return super().step(action)
+
+
+class Buffer(Base):
+    """Writes every observation into one array, and what it does to a control into that."""
+
+    def reset(self, **options: Any) -> Any:
+        super().reset(**options)
+        self.buffer = np.zeros(1, np.float32)
+        return self.buffer, {}
+
+    def step(self, action: Any) -> Any:
+        self.buffer[:] = super().step(action)[0]
+        action *= 0.0
+        return self.buffer, 0.0, False, False, {}
+
+
+class Whole(Base):
+    action_space = gymnasium.spaces.Box(-5, 5, (1,), np.int32)
+
+
+CLASSES = (Terminates, Truncates, Breaks, Swallows, Buffer, Whole)
+for made in CLASSES:
+    gymnasium.register(f"{made.__name__}-v0", made)
+
+
+@pytest.mark.parametrize(("made", "ended"), [(Terminates, "terminated"), (Truncates, "truncated")])
+def test_an_end_ends_the_episode_and_no_row_is_invented(made: type, ended: str) -> None:
+    task = task_of(f"{made.__name__}-v0", 1)
+    for seed in range(2):  # a reset begins another
+        ran = episode.drive(seed, lambda t, x: np.ones(1), task)
+        assert (ran.ended, ran.error) == (ended, None)
+        np.testing.assert_array_equal(ran.trajectory.x[:, 0], [0, 1, 2, 3])
+        assert ran.trajectory.u.shape == (3, 1)
+
+
+def test_the_rows_before_an_exception_are_kept_and_the_environment_is_closed() -> None:
+    Breaks.closed = 0
+    ran = episode.drive(0, lambda t, x: np.ones(1), task_of("Breaks-v0", 1))
+    assert (ran.ended, str(ran.error)) == ("error", "the limit switch opened")
+    np.testing.assert_array_equal(ran.trajectory.x[:, 0], [0, 1, 2, 3])
+    assert Breaks.closed == 1
+
+
+def test_no_control_follows_a_signal_that_the_environment_swallowed() -> None:
+    Swallows.closed, before = 0, {number: signal.getsignal(number) for number in interrupt.SIGNALS}
+    interrupt.listen()
+    try:
+        ran = episode.drive(0, lambda t, x: np.ones(1), task_of("Swallows-v0", 1))
+        assert (ran.ended, type(ran.error)) == ("interrupted", interrupt.Interrupted)
+        assert (len(Swallows.sent), len(ran.trajectory.u), Swallows.closed) == (3, 3, 1)
+        assert interrupt.status() == 130
+    finally:
+        interrupt.listen()
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def test_observations_and_controls_are_copies() -> None:
+    ran = episode.drive(0, lambda t, x: np.full(1, 0.5), task_of("Buffer-v0", 1, horizon=4))
+    np.testing.assert_array_equal(ran.trajectory.x[:, 0], [0, 1, 2, 3, 4])
+    np.testing.assert_array_equal(ran.trajectory.u[:, 0], [0.5] * 4)
+
+
+def test_whole_controls_are_rounded_and_recorded_as_they_were_sent() -> None:
+    asked = np.array([0.4, 0.6, -2.7, 9.0])
+    ran = episode.drive(0, lambda t, x: asked[t : t + 1], task_of("Whole-v0", 1, horizon=4))
+    np.testing.assert_array_equal(ran.trajectory.u[:, 0], [0, 1, -3, 5])
+    assert [(u.dtype, int(u[0])) for u in Whole.sent] == [(np.dtype(np.int32), n) for n in (0, 1, -3, 5)]
+
+
+def test_an_environment_is_used_as_it_was_made() -> None:
+    """Its wrappers decide what its limits are, what it observes, what reaches the motor, and when it is over."""
+    gymnasium.register(
+        "Safe-v0",
+        lambda: gymnasium.wrappers.TimeLimit(
+            gymnasium.wrappers.RescaleAction(Base(), np.float32(-10), np.float32(10)), 4
+        ),
+    )
+    known = env_spec("Safe-v0", start_mean=[0.0])
+    np.testing.assert_array_equal([known.control_low, known.control_high], [[-10], [10]])
+    ran = episode.drive(0, lambda t, x: np.full(1, 5.0), task_of("Safe-v0", 1, low=-10, high=10))
+    assert (ran.ended, len(ran.trajectory.u)) == ("truncated", 4)
+    np.testing.assert_allclose(np.ravel(Base.sent), [0.5] * 4)
+    np.testing.assert_allclose(ran.trajectory.u[:, 0], [5.0] * 4)
+
+
+def test_constructor_arguments_are_what_they_look_like() -> None:
+    seen: dict = {}
+    gymnasium.register("Asks-v0", lambda **given: seen.update(given) or Base())
+    make_env("Asks-v0", ("port=/dev/ttyACM0", "baud=9600", "fast=true"))
+    assert seen == {"port": "/dev/ttyACM0", "baud": 9600, "fast": True}
+
+
+@pytest.mark.parametrize(
+    ("answer", "step", "says"),
+    [
+        (np.zeros(1), None, "its reset returned ndarray; expected (observation, info)"),
+        (
+            (np.zeros(1), {}),
+            (np.zeros(1), 0.0, False, {}),
+            "its step returned 4 values; expected (observation, reward,",
+        ),
+        ((np.zeros(1), {}), (np.zeros((1, 1)), 0.0, False, False, {}), "of shape (1, 1); expected (1,)"),
+        ((np.zeros(1), {}), (None, 0.0, False, False, {}), "it observed an array of shape (); expected (1,)"),
+        ((np.zeros(1), {}), (np.array([np.nan]), 0.0, False, False, {}), "entry 0 of its observation is nan"),
+    ],
+)
+def test_what_is_no_answer_of_gymnasium_is_said(answer: Any, step: Any, says: str) -> None:
+    gymnasium.register("Odd-v0", lambda: Odd(answer, step))
+    ran = episode.drive(0, lambda t, x: np.zeros(1), task_of("Odd-v0", 1))
+    assert ran.ended == "error"
+    assert says in str(ran.error)
+
+
+class Odd(Base):
+    def __init__(self, answer: Any, after: Any) -> None:
+        self.answer, self.after = answer, after
+
+    def reset(self, **options: Any) -> Any:
+        return self.answer
+
+    def step(self, action: Any) -> Any:
+        return self.after
+
+
+@pytest.mark.parametrize(
+    ("about", "dt"),
+    [({"dt": 0.02}, 0.02), ({"metadata": {"render_fps": 50}}, 0.02), ({"metadata": {"render_fps": None}}, 1)],
+)
+def test_the_control_period_is_what_the_environment_says(about: dict, dt: float) -> None:
+    assert period(type("Timed", (Base,), about)()) == pytest.approx(dt)
+
+
+@pytest.mark.parametrize("dt", [lambda self: 0.05, "fast", 0.0, True])
+def test_a_control_period_that_is_none_is_refused(dt: Any) -> None:
+    with pytest.raises(ValueError, match="not a number of seconds; give dt="):
+        period(type("Timed", (Base,), {"dt": dt})())
+
+
+def test_what_did_not_take_place_costs_what_the_user_says() -> None:
+    task = task_of("Terminates-v0", 1, horizon=6)._replace(stop_cost=0.7)
+    np.testing.assert_allclose(episode.charged([0.1, 0.2], task), [0.1, 0.2, 0.7, 0.7, 0.7, 0.7])
+    exp = compose(tiny(), task)
+    ran = exp.drive(jax.random.key(0), exp.init(jax.random.key(1)).policy.params, True)
+    np.testing.assert_allclose(ran.trajectory.cost, [1.0, 4.0, 9.0])  # of the states 1, 2 and 3
+    whole = exp.episode(jax.random.key(0), exp.init(jax.random.key(1)).policy.params, True)
+    assert (whole.x.shape, whole.u.shape, int(whole.length)) == ((7, 1), (6, 1), 3)
+    state = jax.jit(exp.absorb)(exp.init(jax.random.key(1)), whole)
+    assert int(state.data.size) == 3
+    np.testing.assert_array_equal(state.data.x[:, 0], [0, 1, 2, *[0] * (len(state.data.x) - 3)])
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ([], "task=gym needs env= and cost="),
+        (["env=Pendulum-v1"], "task=gym needs env= and cost="),
+        (["env=Pendulumm-v1", "cost=costs:upright"], "Pendulum"),
+        (["env=CartPole-v1", "cost=costs:upright"], "its action_space is Discrete(2), not a Box"),
+        (["env=Pendulum-v1", "cost=costs:down"], "cost=costs:down cannot be imported"),
+        (["env=Pendulum-v1", "cost=nowhere:down"], "No module named 'nowhere'"),
+        (["env=Pendulum-v1", "cost=costs"], "expected cost=module:function"),
+        (["env=Pendulum-v1", "cost=costs:upright", "angles=[3]"], "choose from 0 to 2"),
+        (["env=Pendulum-v1", "cost=costs:upright", "horizon=0"], "the nearest is 1"),
+    ],
+)
+def test_bad_input_is_one_clear_line(words: list[str], message: str, tmp_path: Path) -> None:
+    done = train(*words, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert message in done.stderr

@@ -1,0 +1,119 @@
+"""Signals: a robot is let go within a second, whatever else goes on, and the exit status says which signal it was."""
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+# A command that opens something to be closed, and then waits for another thread, as for a compiler.
+COMMAND = """
+import signal, sys, threading, time
+from pegasus_jax import interrupt
+{before}
+def close():
+    print("closing", flush=True)
+    {closing}
+    print("closed", flush=True)
+interrupt.before_end(close)
+done = threading.Event()
+threading.Thread(target=lambda: time.sleep(60), daemon=True).start()
+try:
+    interrupt.listen()
+    print("ready", flush=True)
+    {body}
+except KeyboardInterrupt:
+    interrupt.clean_up()
+    interrupt.end(interrupt.status())
+interrupt.clean_up()
+interrupt.end(0 if len(sys.argv) < 2 else int(sys.argv[1]))
+"""
+
+
+def begun(body: str = "done.wait()", closing: str = "pass", before: str = "") -> subprocess.Popen[str]:
+    program = COMMAND.format(body=body, closing=closing, before=before)
+    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def ended(process: subprocess.Popen[str], seconds: float = 20) -> tuple[int, list[str]]:
+    process.wait(seconds)
+    assert process.stdout is not None
+    return process.returncode, process.stdout.read().split()
+
+
+@pytest.mark.parametrize(("number", "status"), [("SIGINT", 130), ("SIGTERM", 143), ("SIGHUP", 129)])
+def test_a_signal_closes_and_ends(number: str, status: int) -> None:
+    """The other thread would go on for a minute."""
+    process = begun()
+    began = time.monotonic()
+    process.send_signal(getattr(signal, number))
+    assert ended(process) == (status, ["closing", "closed"])
+    assert time.monotonic() - began < 10
+
+
+def test_a_signal_while_it_closes_waits_and_a_third_one_does_not() -> None:
+    process = begun(closing="time.sleep(1.5)")
+    process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    process.send_signal(signal.SIGINT)
+    assert ended(process) == (130, ["closing", "closed"])
+    process = begun(closing="time.sleep(60)")
+    for _ in range(3):
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.5)
+    assert ended(process) == (130, ["closing"])
+
+
+def test_a_second_signal_closes_and_ends_at_once() -> None:
+    """The first one is swallowed."""
+    body = (
+        'exec(\'try:\\n    print("inside", flush=True)\\n    done.wait()\\nexcept KeyboardInterrupt:\\n'
+        '    print("swallowed", flush=True)\\n    done.wait()\')'
+    )
+    process = begun(body=body)
+    assert process.stdout is not None
+    assert process.stdout.readline() == "inside\n"
+    process.send_signal(signal.SIGINT)
+    assert process.stdout.readline() == "swallowed\n"
+    process.send_signal(signal.SIGTERM)
+    assert ended(process) == (130, ["closing", "closed"])
+
+
+def test_a_swallowed_signal_is_remembered() -> None:
+    body = "exec('try:\\n    signal.raise_signal(2)\\nexcept KeyboardInterrupt:\\n    pass\\ninterrupt.check()')"
+    assert ended(begun(body=body)) == (130, ["closing", "closed"])
+
+
+def test_the_handlers_of_an_environment_are_called_and_do_not_hide_the_signal() -> None:
+    body = (
+        'exec(\'signal.signal(2, lambda *_: print("theirs", flush=True))\\n'
+        'interrupt.reclaim()\\nsignal.raise_signal(2)\\nprint("lost")\')'
+    )
+    assert ended(begun(body=body)) == (130, ["theirs", "closing", "closed"])
+
+
+def test_what_close_raises_is_said_and_does_not_keep_the_command(capfd: pytest.CaptureFixture[str]) -> None:
+    process = begun(closing="raise OSError('no answer')")
+    process.send_signal(signal.SIGINT)
+    assert ended(process) == (130, ["closing"])
+    assert "pegasus: closing the environment failed, OSError: no answer" in capfd.readouterr().err
+
+
+def test_an_error_does_not_wait_for_the_other_thread() -> None:
+    program = COMMAND.format(body="pass", closing="pass", before="")
+    began = time.monotonic()
+    done = subprocess.run([sys.executable, "-c", program, "2"], capture_output=True, text=True, check=False, timeout=30)
+    assert (done.returncode, done.stdout.split()) == (2, ["ready", "closing", "closed"])
+    assert time.monotonic() - began < 20
+
+
+def test_a_hangup_that_is_ignored_stays_ignored() -> None:
+    """As nohup has it."""
+    process = begun(body="done.wait(1)", before="signal.signal(signal.SIGHUP, signal.SIG_IGN)")
+    process.send_signal(signal.SIGHUP)
+    process.send_signal(signal.SIGTERM)
+    assert ended(process) == (143, ["closing", "closed"])

@@ -1,0 +1,207 @@
+"""What is said while a command runs, and when."""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from pegasus_jax import progress
+from pegasus_jax.progress import Clock, Display, announcement, best_line, duration, stopped, summary
+from pegasus_jax.settings import parse
+
+ROW: dict[str, Any] = {
+    "trial": 7,
+    "plant_seconds": 17.5,
+    "random": False,
+    "policy": 6,
+    "episode_cost": 0.375,
+    "mean_cost": 0.31,
+    "success_rate": 0.85,
+    "objective_last": 0.298,
+    "calibration": 1.34,
+    "skipped_updates": 0,
+    "seconds": {"fit": 15.0, "compile": 3.0},
+}
+UNMEASURED = {"mean_cost": None, "success_rate": None}
+
+
+def test_a_trial_in_one_line() -> None:
+    assert summary([ROW], 15) == (
+        "trial  7/15  17.5 s of plant  episode by the policy of trial 6: cost 0.375"
+        "  policy now: cost 0.310, success 85%, imagined cost 0.298"
+        "  model errors 1.3 times as large as predicted  (18 s, 3 s of it compiling)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "says", "does_not_say"),
+    [
+        (UNMEASURED, "episode by the policy of trial 6: cost 0.375  policy now: imagined cost 0.298", "success"),
+        ({"policy": 4}, "by the policy of trial 4", "trial 6"),
+        ({"policy": 0, "random": True}, "episode of random controls: cost 0.375", "by the policy"),
+        ({**UNMEASURED, "objective_last": None, "calibration": None}, "cost 0.375  (18 s", "policy now"),
+        ({"replaced": False}, "policy kept: cost 0.310", "policy now"),
+        ({"skipped_updates": 3}, "3 updates skipped", "None"),
+    ],
+)
+def test_a_line_says_what_was_executed_and_what_is_known(changes: dict[str, Any], says: str, does_not_say: str) -> None:
+    line = summary([ROW | changes], 15)
+    assert says in line
+    assert does_not_say not in line
+
+
+def test_several_seeds_are_means_and_the_median_of_the_errors() -> None:
+    others = [ROW | {"success_rate": 1.0, "calibration": 2.0}, ROW | {"success_rate": 0.95, "calibration": 9.0}]
+    line = summary([ROW, *others], 15)
+    assert "success 93%" in line
+    assert "2 of 3 seeds solved" in line
+    assert "errors 2.0 times" in line
+    assert "episodes: cost" in summary([ROW, ROW | {"policy": 5}], 15)
+
+
+def test_the_best_policy_is_named() -> None:
+    rows = [ROW | {"trial": n, "policy": n - 1, "success_rate": n / 4, "episode_cost": n / 10} for n in (1, 2, 3)]
+    assert best_line(rows, 2) == "best policy: trial 2 (success 50%, cost 0.310)"
+    robot = [row | UNMEASURED for row in rows]
+    assert best_line(robot, 1) == "best policy: trial 1 (cost 0.200 in 1 of the episodes)"
+    assert best_line(robot, 3) == "best policy: trial 3 (not run yet)"
+
+
+def test_a_person_reads_durations() -> None:
+    assert [duration(s) for s in (0.4, 99, 110, 5000, 9000)] == ["0 s", "99 s", "2 min", "83 min", "2.5 h"]
+
+
+def test_what_will_be_done_and_how_to_go_on(tmp_path: Path) -> None:
+    config = parse({"task": "cartpole", "model": "gp", "trials": "4"})
+    assert announcement(config, Path("runs/a")) == "learning cartpole, model gp, policy mlp: 4 trials, folder runs/a"
+    assert "3 of 4 trials are done, 2 seeds" in announcement(config, Path("runs/a"), 2, 3)
+    assert "begins again" in stopped(tmp_path)
+    run = tmp_path / "my run"
+    run.mkdir()
+    (run / "config.yaml").touch()
+    assert f"pegasus-train resume='{run}' goes on" in stopped(run)
+
+
+class Watch:
+    """A clock that is set by hand."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 100.0
+        monkeypatch.setattr(progress.time, "monotonic", lambda: self.now)
+
+
+def test_only_steady_trials_say_how_long_the_next_ones_take(monkeypatch: pytest.MonkeyPatch) -> None:
+    watch = Watch(monkeypatch)
+    clock = Clock()
+
+    def trial(number: int, *phases: str, takes: float, compiling: float = 0.0) -> None:
+        for phase in phases:
+            clock.phase(number, phase)
+        clock.compiled += compiling
+        watch.now += takes
+
+    learning = ("collect", "fit", "search", "evaluate")
+    trial(1, "collect", takes=1)  # random controls, nothing learned
+    trial(2, *learning, takes=90, compiling=60)
+    trial(3, "read", "fit", "search", takes=5)  # its episode was on disk
+    clock.phase(4, "collect")
+    assert clock.left(10) is None
+    trial(4, *learning, takes=20, compiling=0.5)
+    clock.phase(5, "collect")
+    assert clock.left(10) == pytest.approx(6 * 20)
+    watch.now += 8
+    assert clock.left(10) == pytest.approx(5 * 20 + 12)
+    for number in range(5, 9):
+        trial(number, *learning, takes=40)
+    clock.phase(9, "collect")
+    assert clock.left(10) == pytest.approx(2 * 40)  # the latest trials count
+
+
+def test_a_log_has_a_line_a_phase_and_is_never_silent_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "BRIEF", 0.1)
+    monkeypatch.setattr(progress, "SILENCE", 0.6)
+    text = io.StringIO()
+    with Display(3, Console(file=text, width=200)).running() as display:
+        display.phase(1, "collect")  # too short for a line
+        display.phase(1, "fit")
+        with display.compiling("fit"):
+            time.sleep(0.4)
+        display.phase(1, "search", 0.2, 0.51)
+        time.sleep(1.1)
+    lines = text.getvalue().splitlines()
+    assert lines[0] == "compiling the fit (once)"
+    assert lines[1:] == ["trial 1/3  searching a policy  imagined cost 0.510"] * 2
+    before = text.getvalue()
+    time.sleep(0.8)
+    assert text.getvalue() == before
+
+
+def test_quiet_is_quiet(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(progress, "BRIEF", 0.02)
+    with Display(3, quiet=True).running() as display:
+        display.phase(1, "fit")
+        time.sleep(0.2)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_terminal_says_that_it_compiles_and_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = io.StringIO()
+    with Display(3, Console(file=text, force_terminal=True, width=100)).running() as display:
+        assert display.live is not None
+        display.phase(2, "search", 0.5)
+        with display.compiling("search"):
+            assert display.live.tasks[0].description == "compiling the search (once)"
+        assert display.live.tasks[0].description == "trial 2/3  searching a policy"
+        assert display.live.tasks[0].completed == 0.5
+
+
+def test_nothing_slow_is_imported_before_the_first_line() -> None:
+    """JAX and MuJoCo take seconds; what a command will do is known without them."""
+    code = (
+        "import sys, pegasus_jax.cli, pegasus_jax.progress, pegasus_jax.record, pegasus_jax.settings\n"
+        "print(*{'jax', 'mujoco', 'gymnasium', 'scipy', 'matplotlib'} & set(sys.modules))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == ""
+
+
+def test_words_of_the_environment_come_after_those_that_are_typed(tmp_path: Path) -> None:
+    def helped(words: str) -> subprocess.CompletedProcess[str]:
+        program = [sys.executable, "-c", "from pegasus_jax.cli import train; train()"]
+        return subprocess.run(
+            [*program, "task=cartpole", "trials=9", "--help"],
+            capture_output=True,
+            text=True,
+            check=False,
+            cwd=tmp_path,
+            env={**os.environ, "PEGASUS_SETTINGS": words},
+        )
+
+    assert re.search(r"^  trials=9 ", helped("").stdout, re.MULTILINE)
+    assert re.search(r"^  trials=7 ", helped("trials=7 'policy.hidden=[8]'").stdout, re.MULTILINE)
+    for wrong in ("trials=7 '", "trails=7"):
+        done = helped(wrong)
+        assert (done.returncode, done.stderr.count("\n")) == (2, 1)
+        assert wrong.partition("=")[0] in done.stderr or "PEGASUS_SETTINGS" in done.stderr
+
+
+def test_the_first_line_comes_first_and_a_stop_before_the_run_begins_says_so(tmp_path: Path) -> None:
+    program = [sys.executable, "-c", "from pegasus_jax.cli import train; train()", "task=cartpole", "out=demo"]
+    process = subprocess.Popen(program, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert line == "learning cartpole, model lagrangian, policy mlp: 15 trials, folder demo\n"
+    assert err == "stopped before anything was written to demo; the same command begins again\n"
+    assert process.returncode == 130
