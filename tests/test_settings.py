@@ -257,7 +257,7 @@ WRONG = [
     (["policy.hidden=null"], ["is not a list of whole numbers"]),
     (["model.dropout=[1]"], ["model.dropout=[1] is not a word"]),
     (["model.dropout=null"], ["model.dropout=null is not a word"]),
-    (["seed=${trials}"], ["seed=", "is not a whole number"]),
+    (["seed=${trials}"], ["seed=", "is not a value but a reference"]),
     (["task=gym", "angles=[[1]]"], ["angles=[[1]] is not a list of whole numbers"]),
     (["task=mjcf", "observe=[[qpos.0]]"], ["observe=[[qpos.0]] is not a list of words"]),
     (["policy.input_units=[[1]]"], ["policy.input_units=[[1]] is not a list of numbers"]),

@@ -169,7 +169,7 @@ def origin(run: Path, trial: int) -> tuple[int, str] | None:
     return None if found is None else (int(found["policy"]), str(found["ended"]))
 
 
-def _episode(run: Path, trial: int) -> dict[str, np.ndarray] | None:
+def _episode(run: Path, trial: int) -> dict[str, Any] | None:
     path = episode_path(run, trial)
     if not path.exists():
         return None
