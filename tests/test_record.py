@@ -207,7 +207,7 @@ def test_left_over_files_go_and_no_others(run: Path) -> None:
         "episodes/.0003.npz.0a1b2c3d",
         ".trials.jsonl.abcdef01",
         "checkpoints/.0001.json.tmp_x1y2",
-        "checkpoints/0003/.state.npz.01234567",
+        "checkpoints/0003.orbax-checkpoint-tmp-7",
         ".play.0a1b2c3d",
     ]
     for name in names:

@@ -80,6 +80,7 @@ def test_the_gradient_equals_finite_differences(x64):
     for seed in range(4):
         noise = np.random.default_rng(seed)
         direction = jax.tree.map(lambda leaf, noise=noise: jnp.asarray(noise.normal(size=leaf.shape)), r.params)
+        direction |= {"input": jax.tree.map(jnp.zeros_like, r.params["input"])}  # which is not learned
         move = lambda step, d=direction: jax.tree.map(lambda p, v: p + step * v, r.params, d)  # noqa: E731
         slope = (value(move(1e-6), r.belief, given) - value(move(-1e-6), r.belief, given)) / 2e-6
         np.testing.assert_allclose(optax.tree.vdot(gradient, direction), slope, rtol=1e-5, atol=1e-9)

@@ -140,11 +140,11 @@ def test_an_episode_on_disk_takes_the_place_of_the_plant(whole: Path, tmp_path: 
     run = copy_until(whole, tmp_path / "run", 1)
     other = record.load_episode(whole, 3)
     assert other is not None
-    record.save_episode(run, 2, other, record.task_of(run), policy=1, ended="horizon")
+    record.save_episode(run, 2, other.trajectory, record.task_of(run), policy=1, ended="horizon")
     assert call("train", f"resume={run}", cwd=tmp_path).returncode == 0
     used = record.load_episode(run, 2)
     assert used is not None
-    np.testing.assert_array_equal(used.x, other.x)
+    np.testing.assert_array_equal(used.trajectory.x, other.trajectory.x)
     assert fingerprint(run) != fingerprint(whole)
 
 
@@ -186,7 +186,7 @@ def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_pa
         one, other = record.load_episode(run, trial), record.load_episode(whole, trial)
         assert one is not None
         assert other is not None
-        np.testing.assert_array_equal(one.x, other.x)
+        np.testing.assert_array_equal(one.trajectory.x, other.trajectory.x)
     assert call("evaluate", str(run), cwd=tmp_path).returncode == 0
 
 

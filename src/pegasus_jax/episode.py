@@ -68,18 +68,18 @@ def drive(seed: int, act: Callable[[int, np.ndarray], Any], task: Task) -> Episo
     """
     rows, ended, error, first = [], "horizon", None, None
     try:
-        interrupt.forget_input()
-        interrupt.check()
-        first = x = task.environment.reset(seed)
-        interrupt.reclaim()
-        for t in range(task.horizon):
-            u = act(t, x)
-            interrupt.check()
-            x, sent, over = task.environment.step(u)
-            rows.append((x, sent))
-            if over:
-                ended = over
-                break
+        with interrupt.heard():
+            interrupt.forget_input()
+            first = x = task.environment.reset(seed)
+            interrupt.reclaim()
+            for t in range(task.horizon):
+                u = act(t, x)
+                interrupt.check()
+                x, sent, over = task.environment.step(u)
+                rows.append((x, sent))
+                if over:
+                    ended = over
+                    break
     except BaseException as raised:
         interrupt.let_go(task.environment.close)
         ended, error = "interrupted" if isinstance(raised, KeyboardInterrupt) else "error", raised

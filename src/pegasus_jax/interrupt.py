@@ -5,7 +5,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
@@ -21,6 +22,7 @@ class _State:
 
     listening = False
     closing = False
+    held = False
     asked: list[int] = []  # noqa: RUF012
     cleanups: list[Callable[[], None]] = []  # noqa: RUF012
     others: dict[int, Any] = {}  # noqa: RUF012
@@ -28,7 +30,7 @@ class _State:
 
 def listen() -> None:
     """From now on a signal raises `Interrupted` in the main thread; a second one cleans up and ends the process."""
-    _State.listening, _State.closing = True, False
+    _State.listening, _State.closing, _State.held = True, False, False
     _State.asked.clear()
     _State.others.clear()
     for number in SIGNALS:
@@ -49,6 +51,29 @@ def check() -> None:
     """Raise `Interrupted` if a signal asked to stop, also where somebody's `except` swallowed it."""
     if _State.asked:
         raise Interrupted(_State.asked[0])
+
+
+@contextmanager
+def held() -> Iterator[None]:
+    """Signals wait until the block ends, but where `heard` lets them through: what was measured is to be kept."""
+    before, _State.held = _State.held, True
+    try:
+        yield
+    finally:
+        _State.held = before
+    if not before:
+        check()
+
+
+@contextmanager
+def heard() -> Iterator[None]:
+    """Signals are raised in this block, also within `held`."""
+    before, _State.held = _State.held, False
+    try:
+        check()
+        yield
+    finally:
+        _State.held = before
 
 
 def before_end(cleanup: Callable[[], None]) -> None:
@@ -110,7 +135,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
             other(number, frame)
         except Exception as error:
             print(f"pegasus: a signal handler of the environment failed: {error}", file=sys.stderr)
-    if _State.closing and len(_State.asked) < 3:
+    if (_State.closing and len(_State.asked) < 3) or (_State.held and len(_State.asked) == 1):
         return
     if len(_State.asked) == 1:
         raise Interrupted(number)

@@ -57,7 +57,8 @@ class Jitted:
         """Wait until it is compiled for arguments of these shapes."""
         if self.compiled is None:
             began = time.monotonic()
-            self.compiled = (self.coming or begun(self.compile, *arguments)).result()
+            # Traced here, where JAX has its caller's settings, and compiled elsewhere.
+            self.compiled = (self.coming or begun(self.function.lower(*arguments).compile)).result()
             self.seconds = time.monotonic() - began
 
     def __call__(self, *arguments: Any) -> Any:

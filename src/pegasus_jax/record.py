@@ -34,10 +34,10 @@ if TYPE_CHECKING:  # JAX is imported where it is needed: a command names its fol
 
 FILES = ("config.yaml", "run.json", "trials.jsonl", ".lock")
 FOLDERS = ("episodes", "imagined", "checkpoints", "tensorboard", "plots")
-# What a killed process was writing (files.beside), and pegasus-play.
+# What a killed process was writing (files.beside, orbax), and pegasus-play.
 UNFINISHED = re.compile(
-    r"\.(\d{4,}\.(npz|json)|state\.npz|trials\.jsonl|run\.json|config\.yaml|learning\.png|trial_\d{4,}\.png)"
-    r"\.\w{8}|\.play\.\w{8}"
+    r"\.(\d{4,}\.(npz|json)|trials\.jsonl|run\.json|config\.yaml|learning\.png|trial_\d{4,}\.png)"
+    r"\.\w{8}|\.play\.\w{8}|\d{4,}\.orbax-checkpoint-tmp.*"
 )
 ENDED = ("horizon", "terminated", "truncated", "error", "interrupted")  # how an episode can end
 CUT = ENDED[3:]  # of these, by what is no doing of the policy
@@ -117,7 +117,7 @@ def lock(path: Path, *, new: bool = False) -> FileLock:
 
 def remove_unfinished(run: Path) -> None:
     """Remove the files that killed processes were writing. Only who holds the lock may do that."""
-    for folder in (run, *(run / name for name in FOLDERS), *run.glob("checkpoints/[0-9]*")):
+    for folder in (run, *(run / name for name in FOLDERS)):
         for path in list(folder.iterdir()) if folder.is_dir() else ():
             if UNFINISHED.fullmatch(path.name):
                 shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink(missing_ok=True)

@@ -176,6 +176,10 @@ def handle(words: Sequence[str]) -> None:
     at_once = whole("jobs", options.get("jobs", "2"))
     out = Path(options.get("out", "runs/sweep"))
     of_slurm = {f"slurm_{key[6:]}": value for key, value in rest.items() if key.startswith("slurm.")}
+    if of_slurm and launcher != "slurm":
+        raise SettingError(
+            f"{next(iter(of_slurm)).replace('_', '.', 1)}= is of no use with launcher={launcher}; launcher=slurm"
+        )
     own = {key: value for key, value in rest.items() if not key.startswith("slurm.")}
     whole("seeds", options.get("seeds", "1"))
     jobs = jobs_of(own | {key: options[key] for key in OF_TRAIN if key in options}, out)

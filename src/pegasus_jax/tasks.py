@@ -115,6 +115,10 @@ def pinned(config: Config) -> Config:
             known = env_spec(config.env or "", config.env_args, **given)
         except ValueError as error:
             raise SettingError(f"env={config.env}: {' '.join(str(error).split())}") from error
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            raise SettingError(f"env={config.env}: {user_code.told(error)}") from error
         plain = {
             name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known._asdict().items()
         }
@@ -209,7 +213,9 @@ def environment(config: Config) -> Any:
         return make_env(config.env or "", config.env_args)
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         raise SettingError(f"env={config.env}: {str(error).splitlines()[0]}") from error
-    except Exception as error:
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # sys.exit is one
         given = "; env_args.NAME=VALUE gives arguments" if isinstance(error, TypeError) else ""
         raise SettingError(f"env={config.env} cannot be made: {user_code.told(error)}{given}") from error
     finally:

@@ -1,7 +1,7 @@
 """The main job: an experiment trial by trial, for one seed or many at once, leaving folders that survive anything."""
 
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
-from pegasus_jax import checkpoint, episode, record, restore, settings, tasks, user_code
+from pegasus_jax import checkpoint, episode, interrupt, record, restore, settings, tasks, user_code
 from pegasus_jax.board import Board
 from pegasus_jax.build import build, set_precision
 from pegasus_jax.checks import RunError, SettingError
@@ -218,20 +218,35 @@ def collected(
     """
     episodes = [record.load_episode(run, trial) for run in runs]
     if any(ran is None for ran in episodes):
-        keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(fetched(states.key))
-        random = trial <= config.explore.trials
-        fresh = program.collect(keys, states.policy.params, random)
-        policies = np.asarray(fetched(states.policy_trial))
-        for index, run in enumerate(runs):
-            if episodes[index] is None:
-                episodes[index] = ran = fresh[index]
-                finite(ran.trajectory, task, trial)
-                if leads() and len(ran.trajectory.u):
-                    record.save_episode(
-                        run, trial, ran.trajectory, task, policy=0 if random else int(policies[index]), ended=ran.ended
-                    )
-                failed(ran, task, f"; resume={run} goes on")
+        # What was measured on an environment is stored before a signal is heard again.
+        with interrupt.held() if task.environment is not None else nullcontext():
+            episodes = gathered(states, trial, config, runs, task, program, episodes)
     return [costed(ran, task, trial) for ran in episodes if ran is not None]
+
+
+def gathered(
+    states: RunState,
+    trial: int,
+    config: Config,
+    runs: Sequence[Path],
+    task: Task,
+    program: Program,
+    known: Sequence[Episode | None],
+) -> list[Episode | None]:
+    """The known episodes, and for those that are not, ones that are run on the plant and made durable."""
+    keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(fetched(states.key))
+    random = trial <= config.explore.trials
+    fresh = program.collect(keys, states.policy.params, random)
+    policies = np.asarray(fetched(states.policy_trial))
+    for index, run in enumerate(runs):
+        if known[index] is None:
+            ran = fresh[index]
+            finite(ran.trajectory, task, trial)
+            if leads() and len(ran.trajectory.u):
+                policy = 0 if random else int(policies[index])
+                record.save_episode(run, trial, ran.trajectory, task, policy=policy, ended=ran.ended)
+            failed(ran, task, f"; resume={run} goes on")
+    return [old if old is not None else new for old, new in zip(known, fresh, strict=True)]
 
 
 def finite(trajectory: Trajectory, task: Task, trial: int) -> None:
