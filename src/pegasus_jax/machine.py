@@ -18,7 +18,7 @@ def about(command: str) -> dict[str, Any]:
     """Versions, machine and command: what somebody else needs to repeat the run."""
     import jax
 
-    packages = ("pegasus-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "numpy")
+    packages = ("pegasus-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
     versions = {}
     for name in packages:
         try:
