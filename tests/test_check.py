@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 from pegasus_jax import check
 from pegasus_jax.checks import SettingError
+from pegasus_jax.config import Config
 from pegasus_jax.cost_check import Facts
+from probes import cart
 
 ROBOT = """
 import gymnasium, numpy as np, jax.numpy as jnp
@@ -155,3 +160,20 @@ def test_readings_that_follow_from_others_are_named() -> None:
     assert height.startswith("x2 follows from sin(x0) in")
     (still,) = check.alike(np.column_stack([a, np.full(20, 1e4), np.zeros(20)]))
     assert "the same: x1, x2;" in still
+
+
+@pytest.mark.parametrize(
+    ("stop", "says"),
+    [
+        (lambda x: x > 1, r"returns an array of shape \(2,\)"),
+        (lambda x: 3 * x[0], "is 3 at the start; expected a probability"),
+        (lambda x: x[0] > 0.5, "is 1 at the start: every episode would end there"),
+        (lambda x: x[0] > missing, "NameError"),  # type: ignore[name-defined] # noqa: F821
+        (lambda x: jax.nn.sigmoid(x[0] - 9), None),
+        (lambda x: x[0] > 1.5, None),
+    ],
+)
+def test_where_episodes_end_is_looked_at_before_they_begin(stop: Any, says: str | None) -> None:
+    task, config = cart()._replace(stop=stop), Config(task="gym", stop="robot:fallen")
+    with pytest.raises(SettingError, match=says) if says else nullcontext():
+        check.stopping(config, task)

@@ -6,7 +6,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax import cost_check, tasks
+from pegasus_jax import cost_check, tasks, user_code
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
 from pegasus_jax.types import Task
@@ -34,9 +34,25 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
         task.success,
     )
     notes = cost_check.notes(task.cost, facts, f"cost={config.cost}")
+    stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)
     return [*notes, *plausible(readings, facts), *alike(readings, task.angles)]
+
+
+def stopping(config: Config, task: Task) -> None:
+    """Raises SettingError unless the task's `stop` is one probability, and its episodes do not end where they start."""
+    if task.stop is None:
+        return
+    what = f"stop={config.stop}"
+    with user_code.blamed(what, task.stop):
+        value = jnp.asarray(task.stop(jnp.asarray(task.start_mean, float)))
+    if value.shape != ():
+        raise SettingError(f"{what} returns an array of shape {value.shape}; expected one number in [0, 1], or a bool")
+    if not 0 <= float(value) <= 1:
+        raise SettingError(f"{what} is {float(value):g} at the start; expected a probability in [0, 1], or a bool")
+    if float(value) > 0.5:
+        raise SettingError(f"{what} is {float(value):g} at the start: every episode would end there")
 
 
 def plausible(readings: np.ndarray, facts: cost_check.Facts) -> list[str]:
