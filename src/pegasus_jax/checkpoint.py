@@ -68,7 +68,7 @@ def restore(run: Path, trial: int, like: RunState) -> RunState:
     with _checkpointer() as checkpointer:
         try:
             stored = {name: np.asarray(leaf) for name, leaf in checkpointer.restore(folder.absolute()).items()}
-        except (AttributeError, KeyError, OSError, TypeError, ValueError) as error:
+        except Exception as error:  # orbax raises many kinds for what it cannot read
             raise RunError(f"{folder} is of another version: orbax cannot read it as ours") from error
     stored |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in _named(like).items() if not leaf.size}
     optimizers = {"model": like.model.optimizer, "policy": like.policy.optimizer}
