@@ -70,7 +70,11 @@ def test_several_seeds_are_means_and_the_median_of_the_errors() -> None:
 
 
 def test_the_best_policy_is_named() -> None:
-    rows = [ROW | {"trial": n, "policy": n - 1, "success_rate": n / 4, "episode_cost": n / 10} for n in (1, 2, 3)]
+    known = {"objective_fresh": 0.3}
+    rows = [
+        ROW | known | {"trial": n, "policy": n - 1, "success_rate": n / 4, "episode_cost": n / 10} for n in (1, 2, 3)
+    ]
+    assert best_line([row | {"objective_fresh": None} for row in rows], 3).startswith("no policy was learned")
     assert best_line(rows, 2) == "best policy: trial 2 (success 50%, cost 0.310)"
     robot = [row | UNMEASURED for row in rows]
     assert best_line(robot, 1) == "best policy: trial 1 (cost 0.200 in 1 of the episodes)"

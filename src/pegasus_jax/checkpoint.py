@@ -102,11 +102,11 @@ def _checkpointer() -> Any:
 def _refused(path: Path) -> Iterator[None]:
     """What the file system refuses becomes one OSError that names the path.
 
-    orbax's threads would each print a traceback, also later: they stay silent after a failure, for the command ends.
+    orbax's threads, and those of its futures, would each log or print a traceback, also later: they stay silent after a
+    failure, for the command ends.
     """
-    absl, hook = logging.getLogger("absl"), threading.excepthook
-    level = absl.level
-    absl.setLevel(logging.CRITICAL + 1)
+    level, hook = logging.root.manager.disable, threading.excepthook
+    logging.disable(logging.CRITICAL)
     threading.excepthook = lambda _: None
     try:
         yield
@@ -114,7 +114,7 @@ def _refused(path: Path) -> Iterator[None]:
         full = any(text in str(error) for text in ("No space left", "RESOURCE_EXHAUSTED"))
         number = error.errno if isinstance(error, OSError) and error.errno else errno.ENOSPC if full else errno.EIO
         raise OSError(number, os.strerror(number), str(path)) from error
-    absl.setLevel(level)
+    logging.disable(level)
     threading.excepthook = hook
 
 

@@ -105,15 +105,14 @@ def status() -> int:
 
 def end(code: int) -> None:
     """End the process with this status: what still compiles or computes is waited for by a success only."""
-    others = [thread for thread in threading.enumerate() if thread.daemon]
-    if code == 0:
-        for thread in others:
+    for thread in threading.enumerate() if code == 0 else ():
+        if thread.daemon:
             thread.join()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # nobody reads it any more
             stream.flush()
-    if code >= 128 or (code and any(thread.is_alive() for thread in others)):
-        os._exit(code)  # the compiler's threads cannot be stopped, and other libraries' would be surprised
+    if code:
+        os._exit(code)  # the compiler's threads cannot be stopped, and those of others would complain of the end
     sys.exit(code)
 
 
