@@ -6,6 +6,7 @@ import json
 import logging
 import os
 import shutil
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -102,20 +103,28 @@ def _checkpointer() -> Any:
 def _refused(path: Path) -> Iterator[None]:
     """What the file system refuses becomes one OSError that names the path.
 
-    orbax's threads, and those of its futures, would each log or print a traceback, also later: they stay silent after a
-    failure, for the command ends.
+    orbax's threads, in Python and in C++, would each log or print a traceback of it, also later: of other threads than
+    the main one only the error itself is told.
     """
-    level, hook = logging.root.manager.disable, threading.excepthook
+    level, hooks = logging.root.manager.disable, (sys.unraisablehook, threading.excepthook)
+
+    def of_main_thread(told: Any) -> None:
+        if threading.current_thread() is threading.main_thread():
+            hooks[0](told)
+
     logging.disable(logging.CRITICAL)
-    threading.excepthook = lambda _: None
+    sys.unraisablehook, threading.excepthook = of_main_thread, lambda _: None
     try:
         yield
     except Exception as error:
+        logging.getLogger("absl").setLevel(logging.CRITICAL + 1)
         full = any(text in str(error) for text in ("No space left", "RESOURCE_EXHAUSTED"))
         number = error.errno if isinstance(error, OSError) and error.errno else errno.ENOSPC if full else errno.EIO
         raise OSError(number, os.strerror(number), str(path)) from error
-    logging.disable(level)
-    threading.excepthook = hook
+    else:
+        sys.unraisablehook, threading.excepthook = hooks
+    finally:
+        logging.disable(level)
 
 
 def _named(tree: Any, prefix: str = "") -> dict[str, Any]:
