@@ -88,6 +88,16 @@ def test_a_swallowed_signal_is_remembered() -> None:
     assert ended(begun(body=body)) == (130, ["closing", "closed"])
 
 
+def test_a_signal_that_a_finalizer_loses_is_raised_again() -> None:
+    lost = (
+        "exec('class Loses:\\n    def __del__(self):\\n        signal.raise_signal(2)\\n"
+        'with interrupt.insistent():\\n    Loses()\\n    print("lost", flush=True)\\n    done.wait(30)\')'
+    )
+    began = time.monotonic()
+    assert ended(begun(body=lost)) == (130, ["lost", "closing", "closed"])
+    assert time.monotonic() - began < 10
+
+
 def test_the_handlers_of_an_environment_are_called_and_do_not_hide_the_signal() -> None:
     body = (
         'exec(\'signal.signal(2, lambda *_: print("theirs", flush=True))\\n'

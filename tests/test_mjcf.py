@@ -104,7 +104,9 @@ def test_learns_and_resumes_from_the_command_line(tmp_path: Path) -> None:
     (tmp_path / "cart.xml").write_text(PENDULUM.read_text().replace("9.81", "1.6"))
     again = command(f"resume={run}", "trials=3", cwd=tmp_path)
     assert again.returncode == 2, again.stderr
-    said = f"pegasus: cart is not what {run} began with: its mjcf_digest was"
+    said = (
+        f"pegasus: the task of {run / 'config.yaml'} is not that of run.json, with which it began: its mjcf_digest was"
+    )
     assert again.stderr.splitlines()[-1].startswith(said)
 
 

@@ -52,7 +52,7 @@ def test_a_state_of_other_settings_is_refused_with_the_difference(run: Path) -> 
     with pytest.raises(RunError, match="no checkpoint that this version can use"):
         restore.restored(run)
     change(run, model__hidden=[3], task="double_cartpole")
-    with pytest.raises(RunError, match="is not what"):
+    with pytest.raises(RunError, match="is not that of run"):
         restore.planted(run, settings.load(run / "config.yaml"))
 
 

@@ -181,7 +181,7 @@ def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_pa
     assert refused.stderr.count("\n") == 1
     done = call("train", f"resume={run}", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert "of another version or of other settings" in done.stderr
+    assert "of another version, or of other settings than config.yaml" in done.stderr
     for trial in (1, 2):
         one, other = record.load_episode(run, trial), record.load_episode(whole, trial)
         assert one is not None

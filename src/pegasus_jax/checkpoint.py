@@ -75,7 +75,7 @@ def restore(run: Path, trial: int, like: RunState) -> RunState:
     optimizers = {"model": like.model.optimizer, "policy": like.policy.optimizer}
     rest = like._replace(model=like.model._replace(optimizer=None), policy=like.policy._replace(optimizer=None))
     if difference := _difference(stored, _named(rest)):
-        raise RunError(f"{folder} is of another version or of other settings: {difference}")
+        raise RunError(f"{folder} is of another version, or of other settings than config.yaml: {difference}")
     state = _filled(stored, rest)
     kept = {
         name: _filled(stored, tree, f"{name}.optimizer.") if _suits(stored, tree, f"{name}.optimizer.") else None

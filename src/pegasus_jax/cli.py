@@ -54,13 +54,12 @@ def main(
     try:
         interrupt.listen()
         code = _code(command, words, text)
-    except KeyboardInterrupt:
+    except BaseException as error:
         interrupt.clean_up()
+        if not (interrupt.asked() or isinstance(error, KeyboardInterrupt)):
+            raise
         print(_stopped(cli_train.begun[0]) if cli_train.begun else f"stopped; {stopped}", file=sys.stderr)
         code = interrupt.status()
-    except BaseException:
-        interrupt.clean_up()
-        raise
     interrupt.clean_up()
     interrupt.end(code)
 

@@ -5,12 +5,15 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+
+REMINDER = 0.2  # seconds after which a signal whose exception was lost is raised again
 
 
 class Interrupted(KeyboardInterrupt):
@@ -23,6 +26,8 @@ class _State:
     listening = False
     closing = False
     held = False
+    reminded = False
+    insistent = False
     asked: list[int] = []  # noqa: RUF012
     cleanups: list[Callable[[], None]] = []  # noqa: RUF012
     others: dict[int, Any] = {}  # noqa: RUF012
@@ -30,7 +35,7 @@ class _State:
 
 def listen() -> None:
     """From now on a signal raises `Interrupted` in the main thread; a second one cleans up and ends the process."""
-    _State.listening, _State.closing, _State.held = True, False, False
+    _State.listening, _State.closing, _State.held, _State.insistent = True, False, False, False
     _State.asked.clear()
     _State.others.clear()
     for number in SIGNALS:
@@ -76,6 +81,17 @@ def heard() -> Iterator[None]:
         _State.held = before
 
 
+@contextmanager
+def insistent() -> Iterator[None]:
+    """A signal whose exception was lost, as in a finalizer, is raised again in this block, which calls no robot."""
+    before, _State.insistent = _State.insistent, True
+    try:
+        yield
+    finally:
+        _State.insistent = before
+    check()
+
+
 def before_end(cleanup: Callable[[], None]) -> None:
     """Call `cleanup` when the command ends, whatever ends it."""
     _State.cleanups.append(cleanup)
@@ -96,6 +112,11 @@ def let_go(close: Callable[[], None]) -> None:
         print(f"pegasus: closing the environment failed, {type(error).__name__}: {error}", file=sys.stderr)
     finally:
         _State.closing = False
+
+
+def asked() -> bool:
+    """Whether a signal asked to stop: what is raised after that may be its consequence."""
+    return bool(_State.asked)
 
 
 def status() -> int:
@@ -126,8 +147,24 @@ def forget_input() -> None:
         return
 
 
+def _remind(number: int) -> None:
+    """Send the signal again where `insistent` asks for it."""
+    while True:
+        time.sleep(REMINDER)
+        if _State.insistent:
+            _State.reminded = True
+            signal.pthread_kill(threading.main_thread().ident, number)  # type: ignore[arg-type]
+
+
 def _handle(number: int, frame: FrameType | None) -> None:
+    if _State.reminded:
+        _State.reminded = False
+        if _State.insistent:
+            raise Interrupted(number)
+        return
     _State.asked.append(number)
+    if len(_State.asked) == 1 and hasattr(signal, "pthread_kill"):
+        threading.Thread(target=_remind, args=(number,), daemon=True).start()
     other = _State.others.get(number)
     if callable(other) and other is not signal.default_int_handler:
         try:

@@ -69,11 +69,13 @@ class Display:
             self.live = None
             return
         over = threading.Event()
-        threading.Thread(target=self._log, args=(over,), daemon=True).start()
+        speaker = threading.Thread(target=self._log, args=(over,), daemon=True)
+        speaker.start()
         try:
             yield self
         finally:
             over.set()
+            speaker.join(timeout=1.0)  # so that nothing follows what is said of the end
 
     def phase(self, trial: int, what: str, fraction: float = 0.0, cost: Any = None) -> None:
         """Trial `trial` is doing `what`; `fraction` of it is done, and `cost` [] is what was imagined last."""

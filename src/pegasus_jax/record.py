@@ -220,7 +220,11 @@ def load_imagined(run: Path, trial: int) -> dict[str, np.ndarray] | None:
     found, task = arrays(path, "x", "u", "cost"), task_of(run)
     steps, particles = found["cost"].shape if found["cost"].ndim == 2 else (0, 0)
     shapes = ((steps + 1, particles, len(task.state_names)), (steps, particles, len(task.control_names)))
-    if not steps or (found["x"].shape, found["u"].shape) != shapes or found["x"].dtype.kind != "f":
+    if (
+        not steps
+        or (found["x"].shape, found["u"].shape) != shapes
+        or {found[name].dtype.kind for name in ("x", "u", "cost")} != {"f"}
+    ):
         raise RunError(f"{path} does not hold imagined trajectories of this run; remove it to draw the others")
     return found
 
@@ -312,7 +316,7 @@ def stored(run: Path) -> dict[str, Any]:
         versions = found.get("versions")
         version = versions.get("pegasus-jax") if isinstance(versions, dict) else "of an unknown version"
         raise RunError(
-            f"{run} was made by pegasus-jax {version}, which noted no facts of its task; this version cannot read it"
+            f"{path} is damaged, or of pegasus-jax {version}, which noted no facts of its task: it cannot be read"
         )
     return found
 

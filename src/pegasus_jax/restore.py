@@ -57,7 +57,7 @@ def _state(run: Path, trial: Trial, like: RunState) -> RunState:
         state, problems = newest([run], like, [*checkpoint.available(run)])
         if state is None:
             why = f": {problems[0]}" if problems else f"; resume={run} makes one"
-            raise RunError(f"{run} has no checkpoint that this version can use yet{why}")
+            raise RunError(f"{run / 'checkpoints'} holds no checkpoint that this version can use{why}")
         return jax.tree.map(lambda leaf: leaf[0], state)
     number = best(run) if trial == BEST else trial
     there = checkpoint.available(run)
@@ -73,7 +73,7 @@ def best(run: Path) -> int:
     """The trial after which the best policy of a run was learned. Raises RunError before its first trial has ended."""
     rows = record.trials(run)
     if not rows:
-        raise RunError(f"{run} has no finished trial yet")
+        raise RunError(f"{run / 'trials.jsonl'} holds no finished trial yet")
     following = len(rows) + 1
     ran, origin = record.load_episode(run, following), record.origin(run, following)
     last = None
@@ -186,7 +186,7 @@ def moved(run: Path, config: Config, mjcf: str | None = None) -> Config:
 def same(run: Path, task: Task) -> None:
     """Raises RunError unless this is the task that a run began with, as far as its folder tells."""
     if (run / "run.json").exists() and (what := facts.difference(record.stored(run)["task"], facts.of_task(task))):
-        raise RunError(f"{task.name} is not what {run} began with: {what}")
+        raise RunError(f"the task of {run / 'config.yaml'} is not that of run.json, with which it began: {what}")
 
 
 def announce(run: Path, config: Config) -> None:

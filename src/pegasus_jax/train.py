@@ -1,6 +1,6 @@
 """The main job: an experiment trial by trial, for one seed or many at once, leaving folders that survive anything."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -83,6 +83,10 @@ def train_seeds(
         program.on_compile = held.enter_context(display.running()).compiling
         states = restore.together(folders, experiment, display.line) if resume else None
         done = 0 if states is None else int(states.trial[0])
+        if (most := max([0, *(trial for run in folders for trial in checkpoint.available(run))])) > config.trials:
+            raise RunError(
+                f"{folders[0] / 'config.yaml'} is for trials={config.trials}, and {most} are done; expected at least that"
+            )
         if max(done + 1, config.explore.trials) <= config.trials:  # else no policy is searched
             program.prepare("search")
         keys = jnp.stack([jax.random.key(seed) for seed in seeds])
@@ -112,7 +116,7 @@ def train_seeds(
             display.line(summary(rows, config.trials))
         if final:
             display.phase(config.trials, "collect", 1.0)
-            collected(states, config.trials + 1, config, folders, experiment.task, program)
+            collected(states, config.trials + 1, config, folders, experiment.task, program, display.line)
     return states
 
 
@@ -130,7 +134,7 @@ def one_trial(
     on_disk = all(record.episode_path(run, trial).exists() for run in runs)
     display.phase(trial, "read" if on_disk else "collect")
     policies = np.asarray(fetched(states.policy_trial))
-    episodes = collected(states, trial, config, runs, task, program)
+    episodes = collected(states, trial, config, runs, task, program, display.line)
     shaped = [episode.padded(ran.trajectory, task.horizon) if task.may_end else ran.trajectory for ran in episodes]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *shaped)
     # Before this episode teaches the model, and after another has. No first trial should wait for the compiler.
@@ -209,7 +213,13 @@ def improved(
 
 
 def collected(
-    states: RunState, trial: int, config: Config, runs: Sequence[Path], task: Task, program: Program
+    states: RunState,
+    trial: int,
+    config: Config,
+    runs: Sequence[Path],
+    task: Task,
+    program: Program,
+    say: Callable[[str], None],
 ) -> list[Episode]:
     """The episodes of a trial: those on disk as they are, the others run on the plant and made durable.
 
@@ -221,7 +231,11 @@ def collected(
         # What was measured on an environment is stored before a signal is heard again.
         with interrupt.held() if task.environment is not None else nullcontext():
             episodes = gathered(states, trial, config, runs, task, program, episodes)
-    return [costed(ran, task, trial) for ran in episodes if ran is not None]
+    counted = [costed(ran, task, trial) for ran in episodes if ran is not None]
+    for run, ran, now in zip(runs, episodes, counted, strict=True) if task.environment is None else ():
+        if now is not ran and leads():  # a damaged file, or a cost that its user has mended
+            say(f"{record.episode_path(run, trial)} has costs that are not finite; counted again from its observations")
+    return counted
 
 
 def gathered(

@@ -212,7 +212,7 @@ def others() -> list[Damage]:
         Damage(
             "checkpoints/0002.json", "sums of trial 1", lambda path: shutil.copyfile(path.with_name("0001.json"), path)
         ),
-        Damage("config.yaml", "another width of the model", replaced("- 8", "- 9")),
+        Damage("config.yaml", "another width of the model", replaced("- 8", "- 9"), other_end=True),
         Damage("config.yaml", "another task", replaced("task: cartpole", "task: double_cartpole")),
         Damage("config.yaml", "an unknown key", lambda path: path.write_text(path.read_text() + "unknown: 1\n")),
         Damage("config.yaml", "twice the same key", lambda path: path.write_text(path.read_text() + "seed: 1\n")),

@@ -65,7 +65,7 @@ def judged(damage: Damage, run: Path, what: str, ended: Outcome, right: str) -> 
         return None
     if fingerprint(run) != right:
         return "different end"
-    said = "trials.jsonl" in ended.err + ended.out
+    said = names_it(damage, ended.err + ended.out) or "trials.jsonl" in ended.err + ended.out
     rows, right_rows = (rows_of(run) if (run / "trials.jsonl").is_file() else []), rows_of(run.parent.parent / "end")
     if damage.path == "trials.jsonl" and "bit flipped" in damage.how:  # another digit is a number too
         rows, right_rows = ([row.get("trial") for row in table] for table in (rows, right_rows))

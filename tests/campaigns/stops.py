@@ -32,6 +32,7 @@ SIGNALS = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129, "SIGINT twice": 130}
 MOMENTS = ("import", "compile", "search", "episode", "episode", "episode", "evaluate")
 CLOSE = 1.0  # seconds that `close` may take
 GRACE = 0.05  # seconds in which a control that was on its way may begin
+RETURN = 0.005  # seconds after its last note in which a step returns
 ROBOT_KINDS = (
     "Arm",
     "Arm",
@@ -168,7 +169,8 @@ def judged(case: Case, folder: Path, seen: dict[str, Any]) -> tuple[float | None
     # While the interpreter still imports, before any line of ours, Ctrl-C is Python's own.
     if (opened or case.moment != "import") and "Traceback" in seen["out"] + seen["err"]:
         wrong.append("traceback")
-    done = sum(what == "stepped" for _, what in calls)
+    # The row of a step that has not returned when the signal comes is not known to anybody.
+    done = sum(what == "stepped" and when < sent - RETURN for when, what in calls)
     # A second Ctrl-C ends at once: it closes the environment, and writes nothing more.
     if (
         case.moment == "episode"

@@ -24,7 +24,7 @@ def run_pictures(run: Path, task: Task) -> list[Path]:
     """Draw RUN/plots/learning.png and RUN/plots/trial_NNNN.png for every trial that has been imagined."""
     rows = trials(run)
     if not rows:
-        raise RunError(f"{run} has no finished trial yet")
+        raise RunError(f"{run / 'trials.jsonl'} holds no finished trial yet")
     folder = run / "plots"
     if folder.is_symlink():  # what it points to may be anybody's
         folder.unlink()
