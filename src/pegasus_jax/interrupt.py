@@ -8,12 +8,13 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from types import FrameType
 from typing import Any
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-REMINDER = 0.2  # seconds after which a signal whose exception was lost is raised again
+PAUSE = 0.02  # seconds until a signal whose exception was lost is raised again
 
 
 class Interrupted(KeyboardInterrupt):
@@ -26,8 +27,7 @@ class _State:
     listening = False
     closing = False
     held = False
-    reminded = False
-    insistent = False
+    repeated = False
     asked: list[int] = []  # noqa: RUF012
     cleanups: list[Callable[[], None]] = []  # noqa: RUF012
     others: dict[int, Any] = {}  # noqa: RUF012
@@ -35,7 +35,9 @@ class _State:
 
 def listen() -> None:
     """From now on a signal raises `Interrupted` in the main thread; a second one cleans up and ends the process."""
-    _State.listening, _State.closing, _State.held, _State.insistent = True, False, False, False
+    if not _State.listening:
+        sys.unraisablehook = partial(_unraisable, sys.unraisablehook)
+    _State.listening, _State.closing, _State.held, _State.repeated = True, False, False, False
     _State.asked.clear()
     _State.others.clear()
     for number in SIGNALS:
@@ -79,17 +81,6 @@ def heard() -> Iterator[None]:
         yield
     finally:
         _State.held = before
-
-
-@contextmanager
-def insistent() -> Iterator[None]:
-    """A signal whose exception was lost, as in a finalizer, is raised again in this block, which calls no robot."""
-    before, _State.insistent = _State.insistent, True
-    try:
-        yield
-    finally:
-        _State.insistent = before
-    check()
 
 
 def before_end(cleanup: Callable[[], None]) -> None:
@@ -147,24 +138,30 @@ def forget_input() -> None:
         return
 
 
-def _remind(number: int) -> None:
-    """Send the signal again where `insistent` asks for it."""
-    while True:
-        time.sleep(REMINDER)
-        if _State.insistent:
-            _State.reminded = True
-            signal.pthread_kill(threading.main_thread().ident, number)  # type: ignore[arg-type]
+def _unraisable(otherwise: Callable[[Any], object], told: Any) -> None:
+    """What Python loses, as in a finalizer or in a callback of its garbage collector: a signal is raised again."""
+    if isinstance(told.exc_value, Interrupted):
+        threading.Thread(target=_repeat, args=(told.exc_value.args[0],), daemon=True).start()
+    else:
+        otherwise(told)
+
+
+def _repeat(number: int) -> None:
+    time.sleep(PAUSE)
+    _State.repeated = True
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident, number)  # type: ignore[arg-type]
+    else:
+        signal.raise_signal(number)
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
-    if _State.reminded:
-        _State.reminded = False
-        if _State.insistent:
+    if _State.repeated:
+        _State.repeated = False
+        if not (_State.closing or _State.held):
             raise Interrupted(number)
         return
     _State.asked.append(number)
-    if len(_State.asked) == 1 and hasattr(signal, "pthread_kill"):
-        threading.Thread(target=_remind, args=(number,), daemon=True).start()
     other = _State.others.get(number)
     if callable(other) and other is not signal.default_int_handler:
         try:

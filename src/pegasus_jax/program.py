@@ -142,11 +142,10 @@ class Program:
         if self.mesh is not None:
             arguments = self.laid_out(part, arguments, placed)
         began, compiled = time.monotonic(), jitted.seconds
-        with interrupt.insistent():
-            if jitted.compiled is None:
-                with self.on_compile(part):
-                    jitted.ready(*arguments)
-            result = jitted(*arguments)
+        if jitted.compiled is None:
+            with self.on_compile(part):
+                jitted.ready(*arguments)
+        result = jitted(*arguments)
         compiling = jitted.seconds - compiled
         self.spent[name] = self.spent.get(name, 0.0) + time.monotonic() - began - compiling
         self.spent["compile"] = self.spent.get("compile", 0.0) + compiling

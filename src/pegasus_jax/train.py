@@ -85,7 +85,7 @@ def train_seeds(
         done = 0 if states is None else int(states.trial[0])
         if (most := max([0, *(trial for run in folders for trial in checkpoint.available(run))])) > config.trials:
             raise RunError(
-                f"{folders[0] / 'config.yaml'} is for trials={config.trials}, and {most} are done; expected at least that"
+                f"{folders[0] / 'config.yaml'} has trials={config.trials}, and {most} are done; expected at least that"
             )
         if max(done + 1, config.explore.trials) <= config.trials:  # else no policy is searched
             program.prepare("search")
