@@ -98,6 +98,12 @@ def reached(case: Case, folder: Path, began: float, step: int) -> bool:
     return called.count("stepped") >= case.horizon  # the first episode is over: programs compile, then search
 
 
+def unignored() -> None:
+    """Undo what nohup and a shell's & leave to their children: the commands respect signals that are ignored."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)
+
+
 def started(case: Case, folder: Path, fails: int) -> subprocess.Popen[str]:
     """pegasus-train in `folder`; a cold cache where it should compile for long."""
     told = {**os.environ, "ROBOT_LOG": str(folder / "robot.log"), "ROBOT_FAILS": str(fails)}
@@ -109,8 +115,9 @@ def started(case: Case, folder: Path, fails: int) -> subprocess.Popen[str]:
         "-c",
         "import sys; sys.path.insert(0, ''); from pegasus_jax.cli import train; train()",
     ]
-    pipes = dict(stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    return subprocess.Popen([*program, *words(case)], cwd=folder, env=told, **pipes)  # type: ignore[call-overload]
+    pipes: dict[str, Any] = dict(stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    pipes["preexec_fn"] = unignored
+    return subprocess.Popen([*program, *words(case)], cwd=folder, env=told, **pipes)
 
 
 def stopped(case: Case, folder: Path, limit: float = 120.0) -> dict[str, Any]:
