@@ -32,7 +32,7 @@ SIGNALS = {"SIGINT": 130, "SIGTERM": 143, "SIGHUP": 129, "SIGINT twice": 130}
 MOMENTS = ("import", "compile", "search", "episode", "episode", "episode", "evaluate")
 CLOSE = 1.0  # seconds that `close` may take
 GRACE = 0.05  # seconds in which a control that was on its way may begin
-RETURN = 0.005  # seconds after its last note in which a step returns
+RETURN = 0.05  # seconds after its last note in which a step returns, also on a busy machine
 ROBOT_KINDS = (
     "Arm",
     "Arm",
@@ -176,8 +176,9 @@ def judged(case: Case, folder: Path, seen: dict[str, Any]) -> tuple[float | None
     # While the interpreter still imports, before any line of ours, Ctrl-C is Python's own.
     if (opened or case.moment != "import") and "Traceback" in seen["out"] + seen["err"]:
         wrong.append("traceback")
-    # The row of a step that has not returned when the signal comes is not known to anybody.
-    done = sum(what == "stepped" and when < sent - RETURN for when, what in calls)
+    # A step has returned when another one begins, or after a while; before that nobody knows its row.
+    steps = sum(what == "step" for _, what in calls)
+    done = max(steps - 1, sum(what == "stepped" and when < sent - RETURN for when, what in calls))
     # A second Ctrl-C ends at once: it closes the environment, and writes nothing more.
     if (
         case.moment == "episode"
