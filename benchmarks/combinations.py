@@ -19,9 +19,9 @@ from benchmarks.growth import experience
 from benchmarks.study import RESULTS
 from benchmarks.timing import compiled, in_turn, matmul
 from benchmarks.workloads import ALIKE
-from pegasus_jax import settings
-from pegasus_jax.build import build, set_precision
-from pegasus_jax.machine import about
+from pegasus_jax.builder import build, set_precision
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about
 from pegasus_jax.variants import MODELS, POLICIES
 
 STEPS, PRODUCTS = 4, 500  # in one call
@@ -33,7 +33,7 @@ COMBINATIONS = [{"model": model, "policy": policy, **ALIKE} for policy in POLICI
 
 def step(words: dict[str, str], repeats: int) -> dict[str, float]:
     """Least milliseconds of a search step, seconds to compile it, and the step in products."""
-    config = settings.parse({"trials": "4", **words})
+    config = config_io.parse({"trials": "4", **words})
     set_precision(config)
     experiment = build(config)
     data = experience(100, len(experiment.task.state_names), len(experiment.task.control_names))
@@ -46,7 +46,7 @@ def step(words: dict[str, str], repeats: int) -> dict[str, float]:
 
 def main(words: list[str]) -> None:
     """The command line of this module; the file is written after every row."""
-    options, dotted = settings.split(words, ("repeats",))
+    options, dotted = config_io.split(words, ("repeats",))
     result = {"rows": [], "about": about(shlex.join(["python", "-m", "benchmarks.combinations", *words]))}
     RESULTS.mkdir(exist_ok=True)
     print(f"{'model':15s}{'policy':14s}{'search':10s}{'ms':>9s}{'products':>10s}{'compile s':>11s}")

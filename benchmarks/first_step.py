@@ -23,9 +23,10 @@ STARTED = "PEGASUS_STARTED"  # when the command was given [s since 1970]
 def watched() -> None:
     """`pegasus-train` in this process, whose parts are timed; ends it after the first part of a search."""
     began, words = float(os.environ[STARTED]), sys.argv[1:]
-    from pegasus_jax import cli, program
+    from pegasus_jax.cli import main as cli
+    from pegasus_jax.runs import programs
 
-    run, spent = program.Program.__call__, {}
+    run, spent = programs.Program.__call__, {}
 
     def timed(self: Any, part: str, *arguments: Any, **options: Any) -> Any:
         entered = time.time()
@@ -39,7 +40,7 @@ def watched() -> None:
             os._exit(0)
         return result
 
-    program.Program.__call__ = timed  # type: ignore[method-assign]
+    programs.Program.__call__ = timed  # type: ignore[method-assign]
     sys.argv = ["pegasus-train", *words]
     cli.train()
 
@@ -58,10 +59,10 @@ def once(words: list[str], cache: str) -> dict[str, float]:
 def main(words: list[str]) -> None:
     """The command line of this module."""
     from benchmarks.study import RESULTS  # here: what this module imports, the measured process waits for
-    from pegasus_jax import settings
-    from pegasus_jax.machine import about, processors
+    from pegasus_jax.runs import config_io
+    from pegasus_jax.runs.machine import about, processors
 
-    options, rest = settings.split(words, ("repeats",))
+    options, rest = config_io.split(words, ("repeats",))
     train = [f"{key}={value}" for key, value in ({"task": "cartpole"} | rest).items()]
     rows: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
     for _ in range(int(options.get("repeats", "3"))):

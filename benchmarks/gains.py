@@ -14,7 +14,7 @@ import numpy as np
 
 from benchmarks.feedback import NAMES, ROLL, episodes
 from pegasus_envs.swimmer import swimmer
-from pegasus_jax import settings
+from pegasus_jax.runs import config_io
 
 CANDIDATES, ELITE, STARTS = 32, 8, 2
 GUESS = dict(zip(NAMES, (0.6, 0.3, 0.0, 0.5, 0.05, 0.2, 0.1, 0.5, 0.5, 0.4, 0.0), strict=True))
@@ -48,7 +48,7 @@ def search(task: str, legs: int, generations: int, seed: int) -> np.ndarray:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, _ = settings.split(words, ("legs", "task", "generations", "seed"))
+    options, _ = config_io.split(words, ("legs", "task", "generations", "seed"))
     task, legs = options.get("task", "knife_edge"), int(options.get("legs", "2"))
     if task not in ROLL:
         raise SystemExit(f"task={task} is none of {', '.join(ROLL)}")

@@ -22,9 +22,10 @@ import jax.numpy as jnp
 from benchmarks.suite import RESULTS
 from benchmarks.timing import compiled, in_turn, matmul, summary
 from benchmarks.workloads import ALIKE
-from pegasus_jax import dataset, settings
-from pegasus_jax.build import build, set_precision
-from pegasus_jax.machine import about
+from pegasus_jax.builder import build, set_precision
+from pegasus_jax.learn import data as dataset
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about
 from pegasus_jax.types import Batch, Dataset, Trajectory
 
 PILCO = {"policy": "rbf", "algorithm": "pilco"}
@@ -50,7 +51,7 @@ def experience(rows: int, states: int, controls: int) -> Dataset:
 
 def costs(method: dict[str, str], rows: int, words: dict[str, str], repeats: int) -> dict[str, float]:
     """Milliseconds of each part."""
-    config = settings.parse({**method, **words, "trials": str(-(-rows // 25))})
+    config = config_io.parse({**method, **words, "trials": str(-(-rows // 25))})
     set_precision(config)
     experiment = build(config)
     dynamics, task = experiment.dynamics, experiment.task
@@ -73,7 +74,7 @@ def costs(method: dict[str, str], rows: int, words: dict[str, str], repeats: int
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, dotted = settings.split(words, ("rows", "repeats"))
+    options, dotted = config_io.split(words, ("rows", "repeats"))
     sizes = [int(n) for n in options.get("rows", "50,100,200,400,800").split(",")]
     repeats = int(options.get("repeats", "3"))
     table: list[dict[str, Any]] = []

@@ -20,9 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.study import RESULTS
-from pegasus_jax import controller, settings, tasks
-from pegasus_jax.machine import about
-from pegasus_jax.train import train
+from pegasus_jax import controller, tasks
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about
+from pegasus_jax.runs.train import train
 
 TINY = {"fit.steps": "20", "search.steps": "20", "horizon": "200", "trials": "2", "evaluation": "5"}
 CALLS = 2000
@@ -66,9 +67,9 @@ def microseconds(seconds: list[float]) -> dict[str, float]:
 def main(words: list[str]) -> None:
     """The command line of this module."""
     gymnasium.register("Still-v0", Still)
-    _, dotted = settings.split(words)
+    _, dotted = config_io.split(words)
     fixed = {"task": "gym", "env": "Still-v0", "cost": f"{__name__}:cost", "start_mean": "[0]"}
-    config = tasks.pinned(settings.parse({**fixed, **TINY, **dotted}))
+    config = tasks.pinned(config_io.parse({**fixed, **TINY, **dotted}))
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         train(config, run)

@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.study import RESULTS
-from pegasus_jax import episode, settings
-from pegasus_jax.angles import difference
-from pegasus_jax.build import build, set_precision
-from pegasus_jax.calibration import one_step_errors, overconfidence
+from pegasus_jax import episode
+from pegasus_jax.builder import build, set_precision
 from pegasus_jax.config import Config
-from pegasus_jax.machine import about
+from pegasus_jax.math.angles import difference
+from pegasus_jax.models.calibration import one_step_errors, overconfidence
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about
 from pegasus_jax.types import Array, Key, RunState, Task, Trajectory
 
 TESTS = 20
@@ -79,13 +80,13 @@ def rounded(values: Array) -> list[float]:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, rest = settings.split(words, ("episodes", "models"))
+    options, rest = config_io.split(words, ("episodes", "models"))
     counts = sorted(int(count) for count in options.get("episodes", "4,10,20").split(","))
     rest = {"task": "double_cartpole", "trials": str(counts[-1])} | rest
     path = RESULTS / f"model_error-{rest['task']}.json"
     rows: dict[str, Any] = {}
     for model in options.get("models", MODELS).split(","):
-        rows[model] = errors(settings.parse({"precision": EXACT.get(model, "single"), "model": model} | rest), counts)
+        rows[model] = errors(config_io.parse({"precision": EXACT.get(model, "single"), "model": model} | rest), counts)
         for count, row in rows[model].items():
             print(
                 f"{model:11s} {count:>3s} episodes  median {row['median']}  calibration {row['calibration']}",

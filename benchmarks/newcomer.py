@@ -21,10 +21,10 @@ from queue import SimpleQueue
 from typing import Any
 
 from benchmarks.study import RESULTS, seed_list
-from pegasus_jax import settings
-from pegasus_jax.machine import about
-from pegasus_jax.record import trials
-from pegasus_jax.sweep import PROGRAM
+from pegasus_jax.cli.sweep import PROGRAM
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about
+from pegasus_jax.runs.store import trials
 
 Slots = SimpleQueue[set[int] | None]
 
@@ -60,7 +60,7 @@ def newcomer(seed: int, words: list[str], limit: float, slots: Slots) -> dict[st
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, rest = settings.split(words, ("seeds", "minutes", "jobs"))
+    options, rest = config_io.split(words, ("seeds", "minutes", "jobs"))
     jobs, limit = int(options.get("jobs", "1")), 60 * float(options.get("minutes", "4"))
     train = [f"{key}={value}" for key, value in ({"task": "cartpole"} | rest).items()]
     slots: Slots = SimpleQueue()

@@ -28,8 +28,8 @@ from pegasus_envs.goals import Task
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames
 from pegasus_envs.swimmer import swimmer
-from pegasus_jax import settings
-from pegasus_jax.restore import ready
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.restore import ready
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
 
@@ -98,7 +98,7 @@ def main(words: list[str]) -> None:
     plants()
     if words == ["plants"]:
         return
-    options, _ = settings.split(words, ("run",))
+    options, _ = config_io.split(words, ("run",))
     swing_up(Path(options.get("run", "runs/cartpole-seed0")), PICTURES / "swingup.png")
     shutil.copy(RESULTS / "cartpole.png", PICTURES / "cartpole.png")
 

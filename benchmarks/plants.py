@@ -28,7 +28,7 @@ from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.physics import Motion
 from pegasus_envs.plant import Plant, simulate
 from pegasus_envs.swimmer import HIPS, swimmer
-from pegasus_jax.machine import about, processors
+from pegasus_jax.runs.machine import about, processors
 
 SECONDS, SEEDS, TIMES = 20.0, 8, (0.5, 1, 2, 3, 5, 10, 20)
 BATCHES = (1, 10, 100)

@@ -14,17 +14,17 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.study import RESULTS
-from pegasus_jax import checkpoint, record, settings
-from pegasus_jax.machine import about
-from pegasus_jax.program import share_processors
-from pegasus_jax.restore import best
-from pegasus_jax.train import evaluate_run
+from pegasus_jax.runs import checkpoint, config_io, store
+from pegasus_jax.runs.machine import about
+from pegasus_jax.runs.programs import share_processors
+from pegasus_jax.runs.restore import best
+from pegasus_jax.runs.train import evaluate_run
 
 
 def policies(run: Path, episodes: int) -> dict[str, Any]:
     """Success rate and mean cost of the policy after each trial of a run, by trial."""
     found = {trial: evaluate_run(run, episodes, 0, trial) for trial in sorted(checkpoint.available(run))}
-    rows = record.trials(run)
+    rows = store.trials(run)
     return {
         "run": run.name,
         "best": best(run),
@@ -46,7 +46,7 @@ def line(found: dict[str, Any]) -> str:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, _ = settings.split([word for word in words if "=" in word], ("episodes",))
+    options, _ = config_io.split([word for word in words if "=" in word], ("episodes",))
     name, *runs = [word for word in words if "=" not in word]
     share_processors(1)
     results = []

@@ -10,9 +10,9 @@ import os
 from pathlib import Path
 
 from benchmarks.study import RESULTS
-from pegasus_jax.report import claims
-from pegasus_jax.report.comparison import draw, results, stored
-from pegasus_jax.report.figures import Figure, read
+from pegasus_jax.studies import claims
+from pegasus_jax.studies.comparison import draw, results, stored
+from pegasus_jax.studies.figures import Figure, read
 
 FIGURES = Path(__file__).parent / "figures"
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"

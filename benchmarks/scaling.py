@@ -30,12 +30,13 @@ from jax.sharding import Mesh
 from benchmarks.study import RESULTS
 from benchmarks.timing import summary
 from benchmarks.workloads import ALIKE, workload
-from pegasus_jax import mesh, settings
-from pegasus_jax.build import build, compose, set_precision
+from pegasus_jax import sharding
+from pegasus_jax.builder import build, compose, set_precision
 from pegasus_jax.config import Config
-from pegasus_jax.machine import about
-from pegasus_jax.program import LASTING, Jitted, compiler_options, over_seeds, placed
-from pegasus_jax.trial import EVALUATE, trial_key
+from pegasus_jax.experiment import EVALUATE, trial_key
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about
+from pegasus_jax.runs.programs import LASTING, Jitted, compiler_options, over_seeds, placed
 from pegasus_jax.types import Array, Experiment, RunState
 
 Row = dict[str, Any]
@@ -48,7 +49,7 @@ EPISODES = 20  # of evaluation
 
 def spread(function: Callable[..., Any], axes: tuple[int | None, ...], seeds: int, over: Mesh | None) -> Jitted:
     """The function over seeds, and these over a mesh, as `pegasus-train seeds= mesh=` compiles it."""
-    layout = {} if over is None else {"out_shardings": mesh.over_seeds(over)}
+    layout = {} if over is None else {"out_shardings": sharding.over_seeds(over)}
     how = compiler_options(LASTING)
     return Jitted(over_seeds(function, axes, seeds=seeds, over=over), compiler_options=how, **layout)
 
@@ -97,7 +98,7 @@ def study(config: Config, seeds: int, over: Mesh | None, report: Callable[[Row],
 
 def on_devices(tree: Any, over: Mesh | None) -> Any:
     """The tree [S, ...] with its seeds laid out over the mesh."""
-    return tree if over is None else placed(tree, mesh.over_seeds(over))
+    return tree if over is None else placed(tree, sharding.over_seeds(over))
 
 
 def collectives(jitted: Jitted) -> int:
@@ -114,19 +115,19 @@ def peaks(devices: int) -> list[float]:
 
 def of_seeds(options: dict[str, str], words: dict[str, str], report: Report) -> None:
     """The whole experiment, one device."""
-    config = settings.parse({"task": "cartpole", "model": "log_normal", **ALIKE, **words})
+    config = config_io.parse({"task": "cartpole", "model": "log_normal", **ALIKE, **words})
     for count in numbers(options, "counts", "10,100"):
         study(config, count, None, partial(report, f"{count} seeds"))
 
 
 def of_devices(options: dict[str, str], words: dict[str, str], report: Report) -> None:
     """A few trials of many seeds, on more and more devices."""
-    config = settings.parse({"task": "cartpole", "model": "log_normal", **ALIKE, "trials": "3", **words})
+    config = config_io.parse({"task": "cartpole", "model": "log_normal", **ALIKE, "trials": "3", **words})
     (seeds,) = numbers(options, "seeds", "100")
     first = None
     for count in sorted(numbers(options, "devices", "1,2,4")):
         name = f"{count} devices"
-        row = study(config, seeds, mesh.mesh(count, 1), partial(report, name))
+        row = study(config, seeds, sharding.mesh(count, 1), partial(report, name))
         seconds = statistics.median(row["trial_s"][1:] or row["trial_s"])  # the first one warms devices up
         first = first or seconds * count
         report(name, {**row, "trial_after_first_s": seconds, "efficiency": first / (count * seconds)})
@@ -135,18 +136,18 @@ def of_devices(options: dict[str, str], words: dict[str, str], report: Report) -
 def of_particles(options: dict[str, str], words: dict[str, str], report: Report) -> None:
     """Search steps of very many particles, on more and more devices."""
     words = {"task": "cartpole", "model": "log_normal", **ALIKE, "search.particles": "100000", **words}
-    config = settings.parse(words)
+    config = config_io.parse(words)
     small = workload({**words, "search.particles": "100"})  # nothing in a state depends on K
     states = jax.tree.map(lambda leaf: leaf[None], small.state)
     (steps,), (repeats,) = numbers(options, "steps", "5"), numbers(options, "repeats", "5")
     first = None
     for count in numbers(options, "devices", "1,4"):
-        over = mesh.mesh(1, count)
+        over = sharding.mesh(1, count)
         experiment = compose(config, small.task, mesh=over)
         search = spread(partial(experiment.search, steps=steps), (0, None), 1, over)
         arguments: tuple[Any, ...] = (states, jnp.int32(1))  # not 0, which would also weigh a fresh policy
         if over is not None:
-            arguments = placed(states, mesh.over_seeds(over)), placed(jnp.int32(1), mesh.shared(over))
+            arguments = placed(states, sharding.over_seeds(over)), placed(jnp.int32(1), sharding.shared(over))
         _, info = search(*arguments)
         times = []
         for _ in range(repeats):
@@ -181,7 +182,7 @@ PARTS = {"seeds": of_seeds, "devices": of_devices, "particles": of_particles}
 def main(words: list[str]) -> None:
     """The command line of this module."""
     part, *rest = words
-    options, dotted = settings.split(rest, ("counts", "devices", "seeds", "steps", "repeats", "out"))
+    options, dotted = config_io.split(rest, ("counts", "devices", "seeds", "steps", "repeats", "out"))
     path = Path(options.get("out", RESULTS)) / f"scaling-{part}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     result: dict[str, Any] = {"rows": {}, "about": about(shlex.join(["python", "-m", "benchmarks.scaling", *words]))}

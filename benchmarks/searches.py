@@ -19,13 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.study import RESULTS
-from pegasus_jax import settings
-from pegasus_jax.build import build, set_precision
+from pegasus_jax.builder import build, set_precision
 from pegasus_jax.config import Config
-from pegasus_jax.machine import about
-from pegasus_jax.program import LASTING, compiler_options
-from pegasus_jax.study import seed_list
-from pegasus_jax.trial import trial
+from pegasus_jax.experiment import trial
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about
+from pegasus_jax.runs.programs import LASTING, compiler_options
+from pegasus_jax.studies.study import seed_list
 from pegasus_jax.types import Array, RunState
 
 FRESH = 99  # seed of the policies that know nothing
@@ -60,8 +60,8 @@ def searched(config: Config, states: RunState, fresh: int) -> Array:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, dotted = settings.split(words, ("seeds", "after", "fresh", "each", "out"))
-    config = settings.parse(dotted)
+    options, dotted = config_io.split(words, ("seeds", "after", "fresh", "each", "out"))
+    config = config_io.parse(dotted)
     set_precision(config)
     after = [int(text) for text in options.get("after", "2,4").split(",")]
     states = learned(config, seed_list(options.get("seeds", "0-5")), after)
@@ -72,7 +72,7 @@ def main(words: list[str]) -> None:
     }
     for variant in ["", *filter(None, map(str.strip, options.get("each", "").split(";")))]:
         changes = dict(word.split("=", 1) for word in variant.split())
-        changed = settings.parse({**dotted, **changes, "search.restart": "false"})
+        changed = config_io.parse({**dotted, **changes, "search.restart": "false"})
         costs = np.asarray(searched(changed, states, int(options.get("fresh", "12"))))
         result["imagined"][variant or "as it is"] = costs.round(4).tolist()
         path.write_text(json.dumps(result) + "\n")

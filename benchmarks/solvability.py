@@ -18,8 +18,8 @@ import numpy as np
 from benchmarks.feedback import GAINS, ROLL, episodes
 from benchmarks.study import RESULTS
 from pegasus_envs.swimmer import swimmer
-from pegasus_jax import settings
-from pegasus_jax.machine import about
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about
 
 COLUMNS = ("mean_square", "roll", "pitch", "yaw", "depth", "rate")
 """mean |e|^2 of 20 s, all terms unweighted; over the last 10 s: RMSE of roll (of roll rate for the corkscrew), pitch,
@@ -74,7 +74,7 @@ def line(name: str, values: Any) -> str:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, _ = settings.split(words, ("starts",))
+    options, _ = config_io.split(words, ("starts",))
     starts = int(options.get("starts", "16"))
     rows = {legs: solvability(legs, starts) for legs in (2, 6)}
     print(" " * 28 + "".join(f"{name:>13s}" for name in COLUMNS))

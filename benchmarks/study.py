@@ -9,10 +9,10 @@ import shlex
 import sys
 from pathlib import Path
 
-from pegasus_jax import settings
-from pegasus_jax.machine import about
-from pegasus_jax.program import share_processors
-from pegasus_jax.study import seed_list, study, table, write
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about
+from pegasus_jax.runs.programs import share_processors
+from pegasus_jax.studies.study import seed_list, study, table, write
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -20,8 +20,8 @@ RESULTS = Path(__file__).parent / "results"
 def main(words: list[str], module: str = "benchmarks.study") -> None:
     """The command line of this module, or of another that changes what it runs."""
     name, *rest = words
-    options, dotted = settings.split(rest, ("seeds",))
-    config = settings.parse(dotted)
+    options, dotted = config_io.split(rest, ("seeds",))
+    config = config_io.parse(dotted)
     path = RESULTS / f"{name}.json"
     RESULTS.mkdir(exist_ok=True)
     seeds = seed_list(options.get("seeds", "0-9"))

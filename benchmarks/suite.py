@@ -22,10 +22,10 @@ import numpy as np
 
 from benchmarks.timing import clock, compiled, in_turn, matmul, own_products, summary
 from benchmarks.workloads import SIZES, Workload, flop, workload
-from pegasus_jax import settings
-from pegasus_jax.build import build
+from pegasus_jax.builder import build
 from pegasus_jax.config import Config
-from pegasus_jax.machine import about, processors
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about, processors
 
 RESULTS = Path(__file__).parent / "results"
 STEPS, FIT_STEPS, PRODUCTS = 10, 100, 500  # steps, and products, in one timed run
@@ -143,7 +143,7 @@ def suite(words: Words, repeats: int, quick: bool) -> dict[str, Row]:
         search = partial(work.experiment.search, steps=1)
         rows["search step, six-legged swimmer with K=1000"] = measure(search, work.state, jnp.int32(1), repeats=1)
     cartpole = {**SIZES["cart-pole"], **words}
-    rows |= trial_parts(settings.parse(cartpole), repeats)
+    rows |= trial_parts(config_io.parse(cartpole), repeats)
     return rows if quick else rows | growth(cartpole, repeats)
 
 
@@ -163,7 +163,7 @@ def table(rows: dict[str, Row]) -> str:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, dotted = settings.split(words, ("repeats", "quick", "out"))
+    options, dotted = config_io.split(words, ("repeats", "quick", "out"))
     rows = suite(dotted, int(options.get("repeats", "7")), options.get("quick") == "true")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     print(table(rows))

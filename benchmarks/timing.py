@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from benchmarks.workloads import Workload, products
-from pegasus_jax.program import LASTING, compiler_options
+from pegasus_jax.runs.programs import LASTING, compiler_options
 
 Program = Callable[[], Any]
 

@@ -13,12 +13,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax import cost, moments, settings, tasks
-from pegasus_jax.angles import encode
-from pegasus_jax.build import blocks_of, compose
+from pegasus_jax import tasks
+from pegasus_jax.builder import blocks_of, compose
 from pegasus_jax.config import Config
-from pegasus_jax.scenarios import draw
-from pegasus_jax.search import objective
+from pegasus_jax.imagine import costs, matching
+from pegasus_jax.imagine.scenarios import draw
+from pegasus_jax.learn.search import objective
+from pegasus_jax.math.angles import encode
+from pegasus_jax.runs import config_io
 from pegasus_jax.types import Array, Experiment, Params, Period, RunState, Scenarios, Task, Trajectory
 
 # Every iteration alike, as the paper's and the peers' are: what a search refines by is another program.
@@ -72,7 +74,7 @@ class Workload(NamedTuple):
 
 def workload(words: dict[str, str], horizon: int | None = None) -> Workload:
     """The workload of a configuration in `key=value` words, with another horizon than the task's if given."""
-    config = settings.parse(words)
+    config = config_io.parse(words)
     task = tasks.of_config(config)
     task = task._replace(cost=near(task), horizon=horizon or task.horizon)
     experiment = compose(config, task)
@@ -85,8 +87,8 @@ def workload(words: dict[str, str], horizon: int | None = None) -> Workload:
     belief = jax.jit(dynamics.condition)(state.model.params, state.data)
     blocks = blocks_of(config.search.particles, task, dynamics, policy)
     scenarios = jax.jit(partial(draw, blocks=blocks, period=Period()))(jax.random.key(1), 0, belief)
-    match = moments.match if config.search.match else moments.keep
-    value = partial(objective, dynamics=dynamics, policy=policy, match=match, cost=cost.of_particles(task.cost))
+    match = matching.match if config.search.match else matching.keep
+    value = partial(objective, dynamics=dynamics, policy=policy, match=match, cost=costs.of_particles(task.cost))
     return Workload(config, experiment, state, belief, scenarios, value)
 
 
@@ -98,7 +100,7 @@ def goal(task: Task) -> Array:
 def near(task: Task) -> Callable[[Array], Array]:
     """1 - exp(-|features - goal|^2 / (2 F))."""
     target = goal(task)
-    return cost.saturating(lambda x: encode(x, task.angles) - target, len(target) ** 0.5)
+    return costs.saturating(lambda x: encode(x, task.angles) - target, len(target) ** 0.5)
 
 
 def wandering(task: Task, seed: int) -> Trajectory:

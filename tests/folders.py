@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax import checkpoint, record, settings, tasks
-from pegasus_jax.build import compose
-from pegasus_jax.restore import precision
+from pegasus_jax import tasks
+from pegasus_jax.builder import compose
+from pegasus_jax.runs import checkpoint, config_io, store
+from pegasus_jax.runs.restore import precision
 from pegasus_jax.types import Task, Trajectory
 
 TINY = {"task": "cartpole", "model.hidden": "[3]", "policy.hidden": "[3]", "search.steps": "2", "search.particles": "8"}
@@ -34,17 +35,17 @@ def row(trial: int, **known: Any) -> dict[str, Any]:
 
 def a_run(run: Path, trials: int = 3, made: Task | None = None, **changes: str) -> Path:
     """The folder of a run of so many trials, each with an episode, a row and a checkpoint."""
-    config = settings.parse(TINY | {"trials": str(trials)} | {k.replace("__", "."): v for k, v in changes.items()})
+    config = config_io.parse(TINY | {"trials": str(trials)} | {k.replace("__", "."): v for k, v in changes.items()})
     task = made or tasks.make(config.task)
-    record.create(run)
-    settings.save(config, run / "config.yaml")
-    record.note(run, "pegasus-train", 0, task)
+    store.create(run)
+    config_io.save(config, run / "config.yaml")
+    store.note(run, "pegasus-train", 0, task)
     with precision(config):
         state = jax.jit(compose(config, task).init)(jax.random.key(config.seed))
         for trial in range(1, trials + 1):
-            record.save_episode(run, trial, episode(task, trial), task, policy=trial - 1, ended="horizon")
+            store.save_episode(run, trial, episode(task, trial), task, policy=trial - 1, ended="horizon")
             params = jax.tree.map(lambda leaf, trial=trial: leaf + trial / 10, state.policy.params)
             learned = state._replace(policy=state.policy._replace(params=params), trial=jnp.int32(trial))
             checkpoint.save(run, trial, learned)
-    record.write_trials(run, [row(trial) for trial in range(1, trials + 1)])
+    store.write_trials(run, [row(trial) for trial in range(1, trials + 1)])
     return run

@@ -12,11 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax import angles, config, cost, dataset, dropout, scenarios
-from pegasus_jax.dynamics.bnn import bnn
-from pegasus_jax.noisy import HEADS
-from pegasus_jax.policy.mlp import mlp
-from pegasus_jax.policy.squash import SQUASHES, to_limits
+from pegasus_jax import config
+from pegasus_jax.imagine import costs as cost
+from pegasus_jax.imagine import scenarios
+from pegasus_jax.learn import data as dataset
+from pegasus_jax.math import angles
+from pegasus_jax.models import dropout
+from pegasus_jax.models.bnn import bnn
+from pegasus_jax.models.noisy import HEADS
+from pegasus_jax.policies.mlp import mlp
+from pegasus_jax.policies.squash import SQUASHES, to_limits
 from pegasus_jax.types import Dynamics, Policy, Prediction, Task, Trajectory
 
 # What the fits and searches of a run are compiled with, and tests are not where they have the choice (conftest.py).
@@ -236,7 +241,7 @@ def balanced_start(plant: Linear, particles: int) -> Any:
     """(key, belief) -> first states [K, D] with exactly the plant's mean and covariance."""
 
     def start(key, belief):
-        from pegasus_jax.moments import standardise
+        from pegasus_jax.math.linalg import standardise
 
         z = jax.random.normal(key, (particles, plant.mean.shape[0]))
         return plant.mean.astype(z.dtype) + standardise(z) * plant.std.astype(z.dtype)

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pegasus_jax.angles import difference, encode, feature_names, wrap
+from pegasus_jax.math.angles import difference, encode, feature_names, wrap
 
 PI = np.float32(np.pi)
 angle = st.floats(-50, 50, width=32) | st.floats(3, 4, width=32) | st.floats(-4, -3, width=32)

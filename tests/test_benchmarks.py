@@ -11,7 +11,7 @@ import pytest
 
 from benchmarks import compare, scaling, searches, timing
 from benchmarks.workloads import SIZES, flop, products, workload
-from pegasus_jax import machine, settings
+from pegasus_jax.runs import config_io, machine
 from probes import unchecked
 
 TINY = {
@@ -92,7 +92,7 @@ def test_a_workload_is_well_conditioned(work):
 def test_every_size_can_be_asked_for(name):
     """By `sizes=A,B`, and with the tasks' settings as they now are."""
     assert "," not in name
-    assert settings.parse(SIZES[name]).search.refine == 0
+    assert config_io.parse(SIZES[name]).search.refine == 0
 
 
 def test_two_processors_of_one_name_are_told_apart(monkeypatch):

@@ -9,10 +9,10 @@ import optax
 import pytest
 from scipy import stats
 
-from pegasus_jax import dropout
-from pegasus_jax.dynamics.bnn import bnn
-from pegasus_jax.fit import fit, guarded
-from pegasus_jax.noisy import HEADS
+from pegasus_jax.learn.fit import fit, guarded
+from pegasus_jax.models import dropout
+from pegasus_jax.models.bnn import bnn
+from pegasus_jax.models.noisy import HEADS
 from pegasus_jax.types import Batch, Dataset, Learner
 from probes import experience, network
 

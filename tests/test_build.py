@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax import config, config_models, dataset, settings, tasks
-from pegasus_jax.build import (
+from pegasus_jax import config, config_models, tasks
+from pegasus_jax.builder import (
     AGGREGATES,
     EXPLORATIONS,
     build,
@@ -23,12 +23,14 @@ from pegasus_jax.build import (
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config, Period
 from pegasus_jax.config_models import DROPOUTS
-from pegasus_jax.dynamics.gp import gp
-from pegasus_jax.dynamics.ssgp import ssgp
-from pegasus_jax.gaussian import affine
-from pegasus_jax.network import INITIALISERS
-from pegasus_jax.noisy import HEADS
-from pegasus_jax.policy.squash import SQUASHES
+from pegasus_jax.learn import data as dataset
+from pegasus_jax.math.gaussian import affine
+from pegasus_jax.models.network import INITIALISERS
+from pegasus_jax.models.noisy import HEADS
+from pegasus_jax.pilco.gp import gp
+from pegasus_jax.pilco.ssgp import ssgp
+from pegasus_jax.policies.squash import SQUASHES
+from pegasus_jax.runs import config_io
 from pegasus_jax.types import Learner
 from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
 from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, same, tiny
@@ -63,7 +65,7 @@ def test_every_dropout_is_the_one_of_its_name(kind):
 def test_every_variant_has_the_shapes_of_the_loop(model, policy):
     """eval_shape traces the loop without compiling it."""
     task = cart() if model == "lagrangian" else dial()  # which has no rates
-    exp = compose(settings.parse({"model": model, "policy": policy}), task)
+    exp = compose(config_io.parse({"model": model, "policy": policy}), task)
     state = jax.eval_shape(exp.init, jax.random.key(0))
     state = jax.eval_shape(exp.absorb, state, jax.eval_shape(exp.collect, state))
     improved, _ = jax.eval_shape(exp.improve, state)
@@ -74,18 +76,18 @@ def test_every_variant_has_the_shapes_of_the_loop(model, policy):
 
 def test_a_mechanism_needs_coordinates_and_their_rates():
     with pytest.raises(SettingError, match=r"model=lagrangian needs .*task=dial.*the nearest is model=log_normal"):
-        compose(settings.parse({"model": "lagrangian"}), dial())
+        compose(config_io.parse({"model": "lagrangian"}), dial())
 
 
 def test_the_rates_of_a_gym_are_named_and_checked():
     words = {"task": "gym", "env": "InvertedPendulum-v5", "cost": "math:cos", "model": "lagrangian", "angles": "[1]"}
-    compose(known := settings.parse(words | {"rates": "[2,3]"}), tasks.of_config(known))
+    compose(known := config_io.parse(words | {"rates": "[2,3]"}), tasks.of_config(known))
     for rates, expected in (
         ("[2,9]", "rates=9 is not an entry"),
         ("[1,2]", "model=lagrangian needs"),
         ("[2]", "needs"),
     ):
-        wrong = settings.parse(words | {"rates": rates})
+        wrong = config_io.parse(words | {"rates": rates})
         with pytest.raises(SettingError, match=expected):
             compose(wrong, tasks.of_config(wrong))
 
@@ -113,7 +115,7 @@ def test_a_policy_counts_in_the_units_it_is_given():
     ],
 )
 def test_the_size_of_a_gaussian_process_is_the_one_given(words, shape):
-    dynamics = compose(settings.parse(words), cart()).dynamics
+    dynamics = compose(config_io.parse(words), cart()).dynamics
     data = jax.eval_shape(lambda: dataset.empty(9, 2, 1))
     belief = jax.eval_shape(dynamics.condition, jax.eval_shape(dynamics.init, jax.random.key(0)), data)
     draw = jax.eval_shape(dynamics.sample, jax.random.key(0), belief)
@@ -122,7 +124,7 @@ def test_the_size_of_a_gaussian_process_is_the_one_given(words, shape):
 
 @pytest.mark.parametrize("algorithm", sorted({*ALGORITHMS} - {"pilco"}))
 def test_every_algorithm_is_a_matter_of_periods_particles_and_clipping(algorithm):
-    chosen = settings.parse({"algorithm": algorithm})
+    chosen = config_io.parse({"algorithm": algorithm})
     periods, particles, clip = {
         "pegasus": (Period(start=1, dynamics=100, policy=1, sensor=1, match=1), 100, 1.0),  # docs/decisions/0001
         "paper": (Period(start=1, dynamics=0, policy=0, sensor=0, match=0), 100, 1.0),  # Alg. 3

@@ -11,19 +11,15 @@ import optax
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from pegasus_jax import config, cost, moments, scenarios, types
-from pegasus_jax.build import (
-    compose,
-    costs_of,
-    dynamics_of,
-    fit_of,
-    start,
-)
+from pegasus_jax import config, types
+from pegasus_jax.builder import compose, costs_of, dynamics_of, fit_of, start
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Period
-from pegasus_jax.fit import falling
-from pegasus_jax.search import objective
-from pegasus_jax.trial import SEARCH, trial_key
+from pegasus_jax.experiment import SEARCH, trial_key
+from pegasus_jax.imagine import costs as cost
+from pegasus_jax.imagine import matching, scenarios
+from pegasus_jax.learn.fit import falling
+from pegasus_jax.learn.search import objective
 from pegasus_jax.types import Dataset, Learner
 from probes import PENDULUM, cart, known, linear_policy, tiny
 
@@ -186,7 +182,7 @@ def test_what_is_weighed_needs_no_second_program(monkeypatch):
     """The objective is traced as often with a restart and turns as without: to compile it again would take as long."""
     traced = []
     counted = lambda *given, **pieces: traced.append(1) or objective(*given, **pieces)  # noqa: E731
-    monkeypatch.setattr(sys.modules["pegasus_jax.build"], "objective", counted)
+    monkeypatch.setattr(sys.modules["pegasus_jax.builder"], "objective", counted)
 
     def times(**search):
         traced.clear()
@@ -372,5 +368,5 @@ def test_the_search_minimises_what_objective_says():
     blocks = scenarios.blocks(**pieces, start=of_task, particles=5, horizon=2, balanced=False)
     given = scenarios.draw(trial_key(state.key, 0, SEARCH), 0, None, blocks=blocks, period=types.Period())
     of_particles = cost.of_particles(exp.task.cost)
-    by_hand = objective(state.policy.params, None, given, **pieces, match=moments.match, cost=of_particles)
+    by_hand = objective(state.policy.params, None, given, **pieces, match=matching.match, cost=of_particles)
     np.testing.assert_allclose(run(state)[1].objective[0], by_hand, rtol=1e-5)

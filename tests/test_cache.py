@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from pegasus_jax import cache, cli
+from pegasus_jax.cli import main
+from pegasus_jax.runs import cache
 from test_train import call
 
 
@@ -43,7 +44,7 @@ def test_a_user_without_a_home_has_none(monkeypatch: pytest.MonkeyPatch) -> None
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR", raising=False)
     assert cache.folder() is None
-    cli._remember_compilations()
+    main._remember_compilations()
 
 
 def test_an_open_folder_is_named_and_the_command_goes_on(tmp_path: Path) -> None:

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.build import compose
-from pegasus_jax.calibration import calibration
+from pegasus_jax.builder import compose
+from pegasus_jax.models.calibration import calibration
 from pegasus_jax.types import Dynamics, Prediction, Trajectory
 from probes import PENDULUM, cart, experience, known, network, noisy_linear_policy, regression, same, tiny
 

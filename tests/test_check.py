@@ -12,10 +12,10 @@ import jax
 import numpy as np
 import pytest
 
-from pegasus_jax import check
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
-from pegasus_jax.cost_check import Facts
+from pegasus_jax.runs import check
+from pegasus_jax.tasks.cost_check import Facts
 from probes import cart
 
 ROBOT = """

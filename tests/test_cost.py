@@ -12,9 +12,10 @@ from hypothesis import strategies as st
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.swimmer import swimmer
-from pegasus_jax import cost, tasks
-from pegasus_jax.angles import encode
-from pegasus_jax.gaussian import sincos
+from pegasus_jax import tasks
+from pegasus_jax.imagine import costs as cost
+from pegasus_jax.math.angles import encode
+from pegasus_jax.math.gaussian import sincos
 
 COSTS = np.random.default_rng(0).uniform(size=(6, 4)).astype(np.float32)  # [H, K]
 number = st.floats(-5, 5, width=32)

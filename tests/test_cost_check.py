@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax import cost_check, user_code
 from pegasus_jax.checks import SettingError
+from pegasus_jax.tasks import cost_check, user_code
 
 COSTS = """
 import jax, jax.numpy as jnp, numpy as np, math

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.course import either, narrowing, pace, reheated
+from pegasus_jax.learn.schedule import either, narrowing, pace, reheated
 
 
 def test_the_width_narrows_geometrically_and_stays():

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax import dataset
+from pegasus_jax.learn import data as dataset
 from pegasus_jax.types import Trajectory
 
 H, D, U = 5, 3, 2

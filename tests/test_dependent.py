@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pegasus_jax import record
+from pegasus_jax.runs import store
 
 ROBOT = """
 import gymnasium, numpy as np, jax.numpy as jnp
@@ -46,7 +46,7 @@ def test_every_update_is_finite(tmp_path: Path) -> None:
         [*program, *WORDS.split(), *TINY.split()], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    for row in record.trials(tmp_path / "run"):
+    for row in store.trials(tmp_path / "run"):
         assert row["skipped_updates"] == 0
         assert np.isfinite([row["fit_loss"], row["objective_first"], row["objective_last"]]).all()
         assert row["objective_last"] < 1

@@ -12,9 +12,9 @@ import pytest
 
 import pegasus_jax
 from folders import a_run
-from pegasus_jax import record
 from pegasus_jax.checks import RunError
-from pegasus_jax.restore import precision, restored
+from pegasus_jax.runs import store
+from pegasus_jax.runs.restore import precision, restored
 
 X = np.array([0.1, -0.2, 0.3, 3.0])
 
@@ -75,7 +75,7 @@ def test_no_cost_environment_or_model_file_is_needed(tmp_path: Path) -> None:
     )
     assert pegasus_jax.controller(run)(X).shape == (1,)
     with pytest.raises(RunError, match="which was not imported"):
-        record.task_of(run).cost(jnp.zeros(4))
+        store.task_of(run).cost(jnp.zeros(4))
 
 
 def test_wrong_observations_are_refused(runs: dict[str, Path]) -> None:

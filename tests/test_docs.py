@@ -19,7 +19,7 @@ from typing import NamedTuple
 import jax
 import pytest
 
-from pegasus_jax.settings import parse, split
+from pegasus_jax.runs.config_io import parse, split
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]

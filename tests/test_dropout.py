@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import integrate, stats
 from scipy.special import expit
 
-from pegasus_jax import dropout
+from pegasus_jax.models import dropout
 
 WIDTH = 5
 KINDS = {

@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.build import blocks_of, dynamics_of, policy_of
+from pegasus_jax.builder import blocks_of, dynamics_of, policy_of
 from pegasus_jax.config import BNN, MLP
-from pegasus_jax.dynamics.ensemble import ensemble
-from pegasus_jax.scenarios import draw
+from pegasus_jax.imagine.scenarios import draw
+from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.types import Batch, Dataset, Period, Prediction
 from probes import cart
 

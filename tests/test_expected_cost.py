@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pegasus_jax import gaussian
+from pegasus_jax.math import gaussian
 from test_gaussian import COV, MATRIX, MEAN, OFFSET, SAMPLES, D, random_cov, standard_normals
 
 pytestmark = pytest.mark.usefixtures("x64")

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax import settings
-from pegasus_jax.build import compose, dynamics_of
-from pegasus_jax.cost import expected_saturating, saturating, widened
+from pegasus_jax.builder import compose, dynamics_of
+from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
+from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import make
 from pegasus_jax.types import Trajectory
 from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
@@ -52,13 +52,13 @@ FAMILY = [*TURNS, *((*pair, "matched") for pair in PAPER), *MOMENTS]
 def composed(model, policy, how):
     """The member of the family on a cart-pole, and how often its model was traced."""
     chosen = {"model": model, "policy": policy, **({"algorithm": "pilco"} if how == "analytic" else {})}
-    there = settings.leaves(settings.parse(chosen))
+    there = config_io.leaves(config_io.parse(chosen))
     small = {key: value for key, value in SMALL.items() if key in there}
     if model != "ensemble":
         small.pop("model.members", None)
     if how == "kept":
         small |= {"search.match": "false", "search.cost": "particles", "search.widen": "1", "search.restart": "false"}
-    config, task = settings.parse(chosen | small), make("cartpole")
+    config, task = config_io.parse(chosen | small), make("cartpole")
     error, angles = task.plant.error, task.angles
     task = task._replace(
         horizon=HORIZON,

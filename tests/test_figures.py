@@ -9,13 +9,13 @@ import pytest
 
 from benchmarks import results_page
 from benchmarks.study import RESULTS
-from pegasus_jax.build import build
+from pegasus_jax.builder import build
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import BNN, RBF, SSGP, Analytic, Config
-from pegasus_jax.report import claims, comparison
-from pegasus_jax.report.curves import interval, middle
-from pegasus_jax.report.figures import Claim, Figure, read
-from pegasus_jax.study import first_solved, seed_list, short, study
+from pegasus_jax.studies import claims, comparison
+from pegasus_jax.studies.figures import Claim, Figure, read
+from pegasus_jax.studies.study import first_solved, seed_list, short, study
+from pegasus_jax.viz.learning_curves import interval, middle
 from probes import unchecked
 from test_train import call
 

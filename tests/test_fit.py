@@ -8,7 +8,7 @@ import numpy as np
 import optax
 import pytest
 
-from pegasus_jax.fit import fit, guarded
+from pegasus_jax.learn.fit import fit, guarded
 from pegasus_jax.types import Dataset, Learner
 from probes import same
 

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pegasus_jax import angles, gaussian
+from pegasus_jax.math import angles, gaussian
 
 SAMPLES = 1_000_000
 D, OUTPUTS, POINTS, WAVES = 3, 2, 8, 8

@@ -9,10 +9,10 @@ import pytest
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from pegasus_jax import kernel
-from pegasus_jax.dynamics.gp import gp, log_evidence
-from pegasus_jax.dynamics.ssgp import ssgp
-from pegasus_jax.lbfgs import full_data
+from pegasus_jax.pilco import kernels
+from pegasus_jax.pilco.gp import gp, log_evidence
+from pegasus_jax.pilco.lbfgs import full_data
+from pegasus_jax.pilco.ssgp import ssgp
 from pegasus_jax.types import Dataset, Learner
 from probes import experience, same
 
@@ -59,11 +59,11 @@ def test_predictions_and_evidence_are_scikit_learns(x64):
     data, model = experience(), gp(**SHAPES)
     params = parameters(model)
     regressors = reference(params, data)
-    rows, h = model.prepare(data), kernel.hyper(params)
+    rows, h = model.prepare(data), kernels.hyper(params)
     evidence = jax.jit(log_evidence)(h, rows)
     np.testing.assert_allclose(evidence, [r.log_marginal_likelihood() for r in regressors], rtol=1e-9)
     loss = jax.jit(model.loss)(params, None, None, rows)
-    np.testing.assert_allclose(loss * 30, kernel.penalty(h) - np.sum(evidence), rtol=1e-12)
+    np.testing.assert_allclose(loss * 30, kernels.penalty(h) - np.sum(evidence), rtol=1e-12)
 
     _, _, (mean_in, std_in), (mean_out, std_out) = scaled(data)
     points = mean_in + std_in * np.random.default_rng(1).normal(size=(20, 6))
@@ -104,12 +104,12 @@ def test_draws_have_the_posterior_mean_and_covariance_whatever_the_number_of_fea
 
 
 def test_the_penalty_is_a_wall():
-    inside = kernel.Hyper(jnp.full((2, 3), 30.0), jnp.ones(2), jnp.full(2, 0.005))
-    assert kernel.penalty(inside) < 0.01
-    corner = kernel.Hyper(jnp.full((2, 3), 100.0), jnp.ones(2), jnp.full(2, 0.001))
-    np.testing.assert_allclose(kernel.penalty(corner), 8, rtol=1e-3)
-    beyond = kernel.Hyper(jnp.full((2, 3), 0.005), jnp.ones(2), jnp.full(2, 0.0005))
-    assert kernel.penalty(beyond) > 100
+    inside = kernels.Hyper(jnp.full((2, 3), 30.0), jnp.ones(2), jnp.full(2, 0.005))
+    assert kernels.penalty(inside) < 0.01
+    corner = kernels.Hyper(jnp.full((2, 3), 100.0), jnp.ones(2), jnp.full(2, 0.001))
+    np.testing.assert_allclose(kernels.penalty(corner), 8, rtol=1e-3)
+    beyond = kernels.Hyper(jnp.full((2, 3), 0.005), jnp.ones(2), jnp.full(2, 0.0005))
+    assert kernels.penalty(beyond) > 100
 
 
 # What both must do

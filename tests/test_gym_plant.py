@@ -14,8 +14,9 @@ import numpy as np
 import pytest
 
 from pegasus_envs.gym_plant import env_plant, env_spec, make_env, period
-from pegasus_jax import episode, interrupt, record, settings
-from pegasus_jax.build import compose
+from pegasus_jax import episode, interrupt
+from pegasus_jax.builder import compose
+from pegasus_jax.runs import config_io, store
 from pegasus_jax.types import Task
 from probes import cart, tiny
 
@@ -45,17 +46,17 @@ def test_an_environment_not_written_for_us(env: str, cost: str, states: int, lim
     """What the run stored is what Gymnasium says: the same controls from the same start give the same observations."""
     done = train(f"env={env}", f"cost={cost}", "horizon=8", *TINY, "out=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    rows = record.trials(tmp_path / "run")
+    rows = store.trials(tmp_path / "run")
     assert [row["random"] for row in rows] == [True, False]
     assert all(np.isfinite(row["mean_cost"]) for row in rows)
     for trial in (1, 2):
-        ran = record.load_episode(tmp_path / "run", trial)
+        ran = store.load_episode(tmp_path / "run", trial)
         assert ran is not None
         steps = len(ran.trajectory.u)  # the double pendulum falls before it is over
         assert ran.trajectory.x.shape == (steps + 1, states)
         assert (steps == 8) == (ran.ended == "horizon")
         assert np.all(np.abs(ran.trajectory.u) <= limit)
-    assert settings.load(tmp_path / "run" / "config.yaml").env == env
+    assert config_io.load(tmp_path / "run" / "config.yaml").env == env
 
 
 def task_of(env: str, states: int, horizon: int = 9, low: float = -2.0, high: float = 2.0) -> Task:

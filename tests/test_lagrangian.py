@@ -9,10 +9,11 @@ import optax
 import pytest
 from scipy.integrate import solve_ivp
 
-from pegasus_jax import dataset, dropout
-from pegasus_jax.dynamics.lagrangian import LEAST_MASS, Belief, Units, lagrangian, solve
-from pegasus_jax.fit import fit, guarded
-from pegasus_jax.noisy import HEADS
+from pegasus_jax.learn import data as dataset
+from pegasus_jax.learn.fit import fit, guarded
+from pegasus_jax.models import dropout
+from pegasus_jax.models.lagrangian import LEAST_MASS, Belief, Units, lagrangian, solve
+from pegasus_jax.models.noisy import HEADS
 from pegasus_jax.types import Learner, Trajectory
 
 SPEEDS = (2, 1)  # x is (cart, pole's speed, cart's speed, pole)
@@ -169,7 +170,7 @@ def test_a_period_is_one_of_lagranges_equations(made_up):
 
 
 def test_without_forces_energy_stays(made_up, monkeypatch):
-    monkeypatch.setattr("pegasus_jax.dynamics.lagrangian.GREATEST_SPEED", 1e3)  # the limit takes a little, else
+    monkeypatch.setattr("pegasus_jax.models.lagrangian.GREATEST_SPEED", 1e3)  # the limit takes a little, else
     calm = {name: np.zeros_like(made_up.params[name]) for name in ("control", "constant", "resistance")}
     belief = made_up._replace(params=made_up.params | calm)
 

@@ -1,6 +1,6 @@
-"""The layers of docs/design.md: imports point strictly downwards, and every file has a layer.
+"""The layers of docs/design.md: imports point strictly downwards, by folder, and within a folder they make no cycle.
 
-A new module: give it a layer in LAYERS. A new arrow within a layer: think first, then list it in SIBLINGS.
+A new folder or top-level file: give it a layer in LAYERS.
 """
 
 from __future__ import annotations
@@ -12,60 +12,35 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-# A name ending in a dot is a package: the layer of everything in it.
+# Folders end in a dot. What one layer holds side by side does not import each other.
 LAYERS = {
-    0: "types checks config config_models variants defaults interrupt",
-    1: "angles mesh quantile dropout whiten moments moments_kernel gaussian cost course dataset scenarios rollout"
-    " episode calibration user_code",
-    2: "network noisy mechanics mechanics_kernel kernel fit lbfgs search population pilco cost_check",
-    3: "dynamics. policy. trial",
-    4: "tasks",
-    5: "build",
-    6: "board cache check checkpoint deploy facts files machine record report. restore cli cli_help cli_runs cli_train"
-    " program progress settings sweep train study __main__ __init__",
+    0: "types checks interrupt",
+    1: "config_models sharding math.",
+    2: "config models. imagine. episode",
+    3: "defaults variants policies. learn.",
+    4: "tasks. pilco. experiment",
+    5: "builder",
+    6: "runs.",
+    7: "viz.",
+    8: "studies.",
+    9: "cli. __init__",
 }
-TOP = max(LAYERS)  # the layer that is an application: here modules may import each other, without cycles
-
-# (importer, imported), both of one layer below TOP.
-SIBLINGS: set[tuple[str, str]] = {
-    ("config_models", "checks"),
-    ("config", "config_models"),  # the settings of the models are its
-    ("config", "checks"),  # a setting is checked when it is made
-    ("defaults", "config"),  # what a task changes in them; a folder's name is made of them
-    ("variants", "config"),  # a variant is made of settings
-    ("dropout", "quantile"),  # uniform draws, and what makes a truncated normal of them
-    ("dataset", "angles"),  # targets are differences of states, and differences of angles wrap
-    ("calibration", "angles"),  # an error of 359 degrees is one of 1
-    ("moments", "mesh"),  # whether particles are whole on one GPU
-    ("moments", "moments_kernel"),  # and are then matched by a kernel
-    ("gaussian", "moments"),  # one Cholesky factor for a few dimensions
-    ("cost", "gaussian"),  # the expected cost of a Gaussian state
-    ("cost", "moments"),  # of the Gaussian with the particles' mean and covariance
-    ("scenarios", "mesh"),  # where the particles that it draws lie
-    ("scenarios", "moments"),  # the noise of moment matching is drawn standardised
-    ("pilco", "lbfgs"),  # one L-BFGS for model and policy
-    ("pilco", "search"),  # and one report of how a search went
-    ("lbfgs", "fit"),  # what every fit reports
-    ("policy.external", "policy.squash"),  # every controller saturates the same ways
-    *((f"policy.{kind}", "policy.scaled") for kind in ("mlp", "linear", "rbf")),  # large inputs, the same way
-    ("noisy", "network"),  # the one network, with noise on its units
-    ("mechanics", "network"),  # a mechanism's energies are that network
-    ("mechanics_kernel", "mechanics"),  # the same equations, where they are compiled by hand
-    ("search", "fit"),  # one guarded optimiser, one count of skipped updates
-}
+APPLICATION = 6  # the first layer that knows of files, terminals and people
 
 # Foreign packages that only some layers may import.
-APPLICATION_ONLY = {"omegaconf", "hydra", "rich", "matplotlib", "tensorboardX"}  # TOP
-ENVIRONMENTS, ENVIRONMENTS_IMPORTER = "pegasus_envs", "tasks"
+APPLICATION_ONLY = {"omegaconf", "hydra", "rich", "matplotlib", "tensorboardX"}
+ENVIRONMENTS, ENVIRONMENTS_IMPORTERS = "pegasus_envs", "tasks."
+
+
+def folder_of(module: str) -> str:
+    """The name in LAYERS of a module given as its dotted name inside the package: "config", "models.bnn"."""
+    head, dot, _ = module.partition(".")
+    return head + dot
 
 
 def layer_of(module: str) -> int | None:
-    """Layer of a module given as its dotted name inside the package: "fit", "dynamics.bnn", "__init__"."""
-    head, dot, _ = module.partition(".")
-    for layer, names in LAYERS.items():
-        if (head + "." if dot else head) in names.split():
-            return layer
-    return None
+    """Layer of a module, or None where its folder has none."""
+    return next((layer for layer, names in LAYERS.items() if folder_of(module) in names.split()), None)
 
 
 def module_name(path: Path, package: Path) -> str:
@@ -118,7 +93,7 @@ def cycles(arrows: dict[str, set[str]]) -> list[str]:
     return found
 
 
-def violations(package: Path, siblings: set[tuple[str, str]] = SIBLINGS) -> list[str]:
+def violations(package: Path) -> list[str]:
     """What is wrong with the imports of the package in this folder, one line each; empty when all is well."""
     files = {module_name(path, package): path for path in sorted(package.rglob("*.py"))}
     problems: list[str] = []
@@ -126,15 +101,15 @@ def violations(package: Path, siblings: set[tuple[str, str]] = SIBLINGS) -> list
     for module, path in files.items():
         here = layer_of(module)
         if here is None:
-            problems.append(f"{path.relative_to(package)}: unknown file: give it a layer in tests/test_layers.py")
+            problems.append(f"{path.relative_to(package)}: unknown: give {folder_of(module)} a layer in test_layers.py")
             continue
         for line, name in imports(path, package):
             where = f"{path.relative_to(package)}:{line}"
             head, _, rest = name.partition(".")
-            if head == ENVIRONMENTS and module != ENVIRONMENTS_IMPORTER:
-                problems.append(f"{where}: only {ENVIRONMENTS_IMPORTER} may import {ENVIRONMENTS}")
-            if head in APPLICATION_ONLY and here < TOP:
-                problems.append(f"{where}: {module} (layer {here}) imports {head}: only layer {TOP} may")
+            if head == ENVIRONMENTS and folder_of(module) != ENVIRONMENTS_IMPORTERS:
+                problems.append(f"{where}: only {ENVIRONMENTS_IMPORTERS} may import {ENVIRONMENTS}")
+            if head in APPLICATION_ONLY and here < APPLICATION:
+                problems.append(f"{where}: {module} (layer {here}) imports {head}: only layer {APPLICATION} and above")
             if head != package.name:
                 continue
             target = resolve(rest, set(files))
@@ -142,9 +117,7 @@ def violations(package: Path, siblings: set[tuple[str, str]] = SIBLINGS) -> list
             if there is None or target == module:
                 continue  # an unknown file is reported on its own; `from . import x` in __init__ may name an attribute
             arrows.setdefault(module, set()).add(target)
-            of_its_own = module.endswith(".__init__") and target.startswith(module.removesuffix("__init__"))
-            sideways = here == there and (here == TOP or of_its_own or (module, target) in siblings)
-            if not (there < here or sideways):
+            if not (there < here or folder_of(module) == folder_of(target)):
                 problems.append(f"{where}: {module} (layer {here}) imports {target} (layer {there}): not downwards")
     return problems + [f"import cycle: {cycle}" for cycle in cycles(arrows)]
 
@@ -164,35 +137,28 @@ def test_environments_know_nothing_of_the_library() -> None:
     assert not found
 
 
-def test_allowed_siblings_are_siblings_and_in_use() -> None:
-    package = ROOT / "src" / "pegasus_jax"
-    files = {module_name(path, package): path for path in package.rglob("*.py")}
-    for importer, imported in SIBLINGS:
-        assert layer_of(importer) == layer_of(imported) != TOP
-        if importer in files:
-            names = [name.partition(".")[2] for _, name in imports(files[importer], package)]
-            assert imported in {resolve(name, set(files)) for name in names}, f"{importer} -> {imported} is not needed"
-
-
 # The checker itself, on a small package with something planted in it.
 
-ALLOWED = {("cost", "moments")}
 CLEAN = {
-    "__init__.py": "from pegasus_jax.build import build\nfrom pegasus_jax.rollout import rollout\n",
+    "__init__.py": "from pegasus_jax.builder import build\nfrom pegasus_jax.imagine.rollout import rollout\n",
     "types.py": "import jax\n",
-    "moments.py": "from pegasus_jax.types import A\n",
-    "cost.py": "from .moments import expectation\nfrom . import types\n",
-    "rollout.py": "from pegasus_jax import types\n",
-    "search.py": "import pegasus_jax.rollout as r\n",
-    "dynamics/__init__.py": "from .bnn import bnn\n",
-    "dynamics/bnn.py": "from ..moments import match\n",
-    "dynamics/gp.py": "",
-    "tasks.py": "import pegasus_envs\n",
-    "build.py": "from pegasus_jax.dynamics import bnn\nfrom pegasus_jax import tasks\n",
-    "report/__init__.py": "",
-    "report/curve.py": "import matplotlib.pyplot as plt\nfrom pegasus_jax import record\n",
-    "record.py": "",
-    "cli.py": "def train():\n    from omegaconf import OmegaConf\n    from pegasus_jax.report import curve\n",
+    "math/__init__.py": "",
+    "math/angles.py": "from pegasus_jax.types import A\n",
+    "imagine/__init__.py": "",
+    "imagine/costs.py": "from ..math.angles import wrap\nfrom .. import types\n",
+    "imagine/rollout.py": "from pegasus_jax import types\nfrom .costs import saturating\n",
+    "learn/__init__.py": "",
+    "learn/search.py": "import pegasus_jax.imagine.rollout as r\n",
+    "models/__init__.py": "from .bnn import bnn\n",
+    "models/bnn.py": "from ..math.angles import wrap\n",
+    "tasks/__init__.py": "import pegasus_envs\n",
+    "builder.py": "from pegasus_jax.models import bnn\nfrom pegasus_jax import tasks\n",
+    "runs/__init__.py": "",
+    "runs/store.py": "def load():\n    from omegaconf import OmegaConf\n",
+    "viz/__init__.py": "",
+    "viz/curve.py": "import matplotlib.pyplot as plt\nfrom pegasus_jax.runs import store\n",
+    "cli/__init__.py": "",
+    "cli/main.py": "def train():\n    from pegasus_jax.viz import curve\n",
 }
 
 
@@ -205,29 +171,35 @@ def plant(folder: Path, changes: dict[str, str]) -> Path:
 
 
 def test_checker_accepts_a_clean_package(tmp_path: Path) -> None:
-    assert violations(plant(tmp_path, {}), ALLOWED) == []
+    assert violations(plant(tmp_path, {})) == []
+
+
+ROLLOUT = "imagine.rollout (layer 2) imports"
 
 
 @pytest.mark.parametrize(
     ("file", "text", "complaint"),
     [
-        ("rollout.py", "from pegasus_jax.search import optimise\n", "rollout (layer 1) imports search (layer 2)"),
-        ("rollout.py", "from .search import optimise\n", "rollout (layer 1) imports search (layer 2)"),
-        ("rollout.py", "def f():\n    import pegasus_jax.search\n", "rollout.py:2: rollout (layer 1) imports search"),
-        ("rollout.py", "from pegasus_jax import optimise\n", "rollout (layer 1) imports __init__ (layer 6)"),
-        ("rollout.py", "if TYPE_CHECKING:\n    from .cost import saturating\n", "rollout (layer 1) imports cost"),
-        ("search.py", "from pegasus_jax.dynamics import bnn\n", "search (layer 2) imports dynamics.bnn (layer 3)"),
-        ("search.py", "import pegasus_jax.dynamics\n", "search (layer 2) imports dynamics.__init__ (layer 3)"),
-        ("dynamics/gp.py", "from . import bnn\n", "dynamics.gp (layer 3) imports dynamics.bnn (layer 3)"),
-        ("dynamics/gp.py", "from ..tasks import cartpole\n", "dynamics.gp (layer 3) imports tasks (layer 4)"),
-        ("moments.py", "from .cost import saturating\n", "import cycle: cost -> moments -> cost"),
-        ("record.py", "from pegasus_jax.report import curve\n", "import cycle: record -> report.curve -> record"),
-        ("build.py", "from pegasus_envs import cartpole\n", "only tasks may import pegasus_envs"),
-        ("build.py", "from omegaconf import OmegaConf\n", "build (layer 5) imports omegaconf"),
+        ("imagine/rollout.py", "from pegasus_jax.learn.search import a\n", f"{ROLLOUT} learn.search (layer 3)"),
+        ("imagine/rollout.py", "from ..learn.search import a\n", f"{ROLLOUT} learn.search (layer 3)"),
+        ("imagine/rollout.py", "def f():\n    import pegasus_jax.learn.search\n", f"rollout.py:2: {ROLLOUT} learn"),
+        ("imagine/rollout.py", "from pegasus_jax import optimise\n", f"{ROLLOUT} __init__ (layer 9)"),
+        ("imagine/rollout.py", "if TYPE_CHECKING:\n    from ..models.bnn import b\n", f"{ROLLOUT} models.bnn"),
+        (
+            "math/angles.py",
+            "from pegasus_jax.models import bnn\n",
+            "math.angles (layer 1) imports models.bnn (layer 2)",
+        ),
+        ("math/angles.py", "import pegasus_jax.models\n", "math.angles (layer 1) imports models.__init__ (layer 2)"),
+        ("models/bnn.py", "from ..tasks import cartpole\n", "models.bnn (layer 2) imports tasks.__init__ (layer 4)"),
+        ("imagine/costs.py", "from .rollout import f\n", "cycle: imagine.costs -> imagine.rollout -> imagine.costs"),
+        ("runs/store.py", "from pegasus_jax.viz import curve\n", "import cycle: runs.store -> viz.curve -> runs.store"),
+        ("builder.py", "from pegasus_envs import cartpole\n", "only tasks. may import pegasus_envs"),
+        ("builder.py", "from omegaconf import OmegaConf\n", "builder (layer 5) imports omegaconf"),
         ("types.py", "import rich.progress\n", "types (layer 0) imports rich"),
-        ("helpers.py", "", "helpers.py: unknown file: give it a layer in tests/test_layers.py"),
-        ("utils/misc.py", "", "utils/misc.py: unknown file: give it a layer in tests/test_layers.py"),
+        ("helpers.py", "", "helpers.py: unknown: give helpers a layer in test_layers.py"),
+        ("utils/misc.py", "", "utils/misc.py: unknown: give utils. a layer in test_layers.py"),
     ],
 )
 def test_checker_catches(tmp_path: Path, file: str, text: str, complaint: str) -> None:
-    assert any(complaint in problem for problem in violations(plant(tmp_path, {file: text}), ALLOWED))
+    assert any(complaint in problem for problem in violations(plant(tmp_path, {file: text})))

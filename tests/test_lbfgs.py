@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from pegasus_jax.lbfgs import full_data, minimise
+from pegasus_jax.pilco.lbfgs import full_data, minimise
 from pegasus_jax.types import Dataset, Learner
 from probes import regression, same
 

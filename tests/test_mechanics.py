@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 
-from pegasus_jax import dropout
-from pegasus_jax import mechanics_kernel as kernel
-from pegasus_jax.dynamics.lagrangian import lagrangian
-from pegasus_jax.noisy import HEADS
+from pegasus_jax.models import _lagrangian_pallas as kernel
+from pegasus_jax.models import dropout
+from pegasus_jax.models.lagrangian import lagrangian
+from pegasus_jax.models.noisy import HEADS
 from pegasus_jax.types import Array, Dataset
 
 # x in the order of a user's, with angles and rates anywhere; widths that are no powers of two are filled up.
@@ -84,7 +84,7 @@ def test_a_model_takes_it_where_there_is_one_gpu(monkeypatch: pytest.MonkeyPatch
     interpreted = kernel.fused
     monkeypatch.setattr(kernel, "fused", fused)
     for there in (False, True):
-        monkeypatch.setattr("pegasus_jax.dynamics.lagrangian.alone_on_gpu", lambda x, there=there: there)
+        monkeypatch.setattr("pegasus_jax.models.lagrangian.alone_on_gpu", lambda x, there=there: there)
         got = model.particles(model.apply)(belief, masks, x, u)
         np.testing.assert_allclose(got.mean, expected.mean, rtol=2e-5, atol=2e-5)
         np.testing.assert_allclose(got.std, expected.std, rtol=1e-6)

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax import mesh
+from pegasus_jax import sharding
 
 
 @pytest.fixture
@@ -16,37 +16,37 @@ def two_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_one_device_is_a_mesh_where_there_are_several(two_gpus: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    one = mesh.mesh(1, 1)
+    one = sharding.mesh(1, 1)
     assert one is not None
-    assert dict(one.shape) == {mesh.SEEDS: 1, mesh.PARTICLES: 1}
+    assert dict(one.shape) == {sharding.SEEDS: 1, sharding.PARTICLES: 1}
     monkeypatch.setattr(jax, "process_count", lambda: 2)  # the others have no device of that mesh
-    assert mesh.mesh(1, 1) is None
+    assert sharding.mesh(1, 1) is None
 
 
 def test_the_only_device_is_no_mesh() -> None:
     assert jax.device_count() == 1
-    assert mesh.mesh(1, 1) is None
+    assert sharding.mesh(1, 1) is None
     with pytest.raises(ValueError, match="needs 2 devices and there is 1"):
-        mesh.mesh(2, 1)
+        sharding.mesh(2, 1)
 
 
 def test_kernels_stay_where_every_device_runs_its_own_seeds(two_gpus: None) -> None:
     seen = []
 
     def double(x: jax.Array, factor: jax.Array) -> jax.Array:
-        seen.append(mesh.alone_on_gpu(x))
+        seen.append(sharding.alone_on_gpu(x))
         return factor * x
 
-    x, one = jnp.arange(3.0), mesh.mesh(1, 1)
+    x, one = jnp.arange(3.0), sharding.mesh(1, 1)
     assert one is not None
     jax.eval_shape(double, x, 2.0)
-    given = mesh.each_its_own(double, one, (0, None), 0)(x, jnp.float32(2))
+    given = sharding.each_its_own(double, one, (0, None), 0)(x, jnp.float32(2))
     np.testing.assert_array_equal(given, 2 * np.arange(3))
     assert seen == [False, True], "the compiler may have split what is given to plain jit"
 
 
 def test_kernels_are_for_single_precision_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not mesh.alone_on_gpu(jnp.zeros(2, jnp.float32)), "a processor"
+    assert not sharding.alone_on_gpu(jnp.zeros(2, jnp.float32)), "a processor"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert mesh.alone_on_gpu(jnp.zeros(2, jnp.float32))
-    assert not mesh.alone_on_gpu(jnp.zeros(2, jnp.float16))
+    assert sharding.alone_on_gpu(jnp.zeros(2, jnp.float32))
+    assert not sharding.alone_on_gpu(jnp.zeros(2, jnp.float16))

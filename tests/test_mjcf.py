@@ -15,10 +15,11 @@ import pytest
 
 from pegasus_envs import mjcf, mjcf_check
 from pegasus_envs.render import frames
-from pegasus_jax import record, settings, tasks
+from pegasus_jax import tasks
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
 from pegasus_jax.defaults import label
+from pegasus_jax.runs import config_io, store
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
 PENDULUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "inverted_pendulum.xml"
@@ -95,9 +96,9 @@ def test_learns_and_resumes_from_the_command_line(tmp_path: Path) -> None:
     done = command(*words, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     run = tmp_path / "runs" / "mjcf-cart-seed0"
-    assert [row["random"] for row in record.trials(run)] == [True, False]
-    assert settings.load(run / "config.yaml").mjcf == str(tmp_path / "cart.xml")
-    ran = record.load_episode(run, 2)
+    assert [row["random"] for row in store.trials(run)] == [True, False]
+    assert config_io.load(run / "config.yaml").mjcf == str(tmp_path / "cart.xml")
+    ran = store.load_episode(run, 2)
     assert ran is not None
     assert (ran.trajectory.x.shape, ran.trajectory.u.shape) == ((9, 4), (8, 1))
     assert np.all(np.abs(ran.trajectory.u) <= 3)

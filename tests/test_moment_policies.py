@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax import angles, gaussian
-from pegasus_jax.policy.external import of_pair
-from pegasus_jax.policy.linear import linear
-from pegasus_jax.policy.rbf import NOISE, rbf
-from pegasus_jax.policy.squash import SQUASHES, to_limits
+from pegasus_jax.math import angles, gaussian
+from pegasus_jax.pilco.rbf import NOISE, rbf
+from pegasus_jax.policies.linear import linear
+from pegasus_jax.policies.squash import SQUASHES, to_limits
+from pegasus_jax.policies.wrap import of_pair
 from probes import LIMITS, dial
 
 F, UNITS = 4, 6

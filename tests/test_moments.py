@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax.moments import cholesky, keep, match, mean_and_cov, standardise
+from pegasus_jax.imagine.matching import keep, match
+from pegasus_jax.math.linalg import cholesky, mean_and_cov, standardise
 
 seeds = st.integers(0, 2**16)
 sizes = pytest.mark.parametrize("size", [1, 4, 7])

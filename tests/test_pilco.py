@@ -9,10 +9,12 @@ import optax
 import pytest
 from scipy.optimize import minimize
 
-from pegasus_jax import angles, cost, gaussian, pilco
-from pegasus_jax.policy.rbf import NOISE, rbf
-from pegasus_jax.policy.squash import SQUASHES, to_limits
-from pegasus_jax.rollout import NoiseUse
+from pegasus_jax.imagine import costs
+from pegasus_jax.imagine.rollout import NoiseUse
+from pegasus_jax.math import angles, gaussian
+from pegasus_jax.pilco import search
+from pegasus_jax.pilco.rbf import NOISE, rbf
+from pegasus_jax.policies.squash import SQUASHES, to_limits
 from pegasus_jax.types import Learner, Policy
 from probes import PENDULUM, SCALAR, known, linear_policy, same
 
@@ -93,13 +95,13 @@ PIECES = dict(dynamics=dynamics(), policy=controller(), angles=(2,))
 
 @cache
 def compiled_step():
-    return jax.jit(lambda mean, cov, blur: pilco.step(mean, cov, blur, policy_params(), 1.0, **PIECES))
+    return jax.jit(lambda mean, cov, blur: search.step(mean, cov, blur, policy_params(), 1.0, **PIECES))
 
 
 @cache
 def compiled_propagation(horizon):
     def propagate(mean, cov, noise):
-        return pilco.propagate(policy_params(), 1.0, (mean, cov), STD, horizon=horizon, noise=noise, **PIECES)
+        return search.propagate(policy_params(), 1.0, (mean, cov), STD, horizon=horizon, noise=noise, **PIECES)
 
     return jax.jit(propagate, static_argnums=2)
 
@@ -253,11 +255,11 @@ def test_many_steps_agree_with_the_published_formulas():
 
 
 def test_the_gradient_equals_finite_differences():
-    expected = cost.expected_saturating(lambda x: jnp.array([x[0] - 1, jnp.sin(x[2]), x[1]]), 1.0, (2,))
+    expected = costs.expected_saturating(lambda x: jnp.array([x[0] - 1, jnp.sin(x[2]), x[1]]), 1.0, (2,))
 
     @jax.jit
     def value(params):
-        return pilco.objective(
+        return search.objective(
             params, 1.0, (MEAN, COV), STD, horizon=4, expected_cost=expected, noise=NoiseUse(1.0, 0.5, 0.5), **PIECES
         )
 
@@ -304,13 +306,21 @@ def test_a_linear_plant_is_propagated_exactly(plant, noise):
     gain = np.random.default_rng(0).normal(size=plant.b.T.shape) - 1
     std, start = 0.1 + np.arange(len(plant.mean)), (plant.mean, np.diag(plant.std**2))
     pieces = linear_pieces(plant)
-    track = pilco.propagate(gain, None, start, std, horizon=plant.horizon, noise=noise, **pieces)
+    track = search.propagate(gain, None, start, std, horizon=plant.horizon, noise=noise, **pieces)
     means, covs = linear_recursion(plant, gain, std, noise)
     np.testing.assert_allclose(track.mean, means, rtol=1e-9)
     np.testing.assert_allclose(track.cov, covs, rtol=1e-9)
     spread = lambda mean, cov: mean @ plant.q @ mean + jnp.trace(plant.q @ cov)  # noqa: E731
-    value = pilco.objective(
-        gain, None, start, std, horizon=plant.horizon, expected_cost=spread, noise=noise, aggregate=cost.total, **pieces
+    value = search.objective(
+        gain,
+        None,
+        start,
+        std,
+        horizon=plant.horizon,
+        expected_cost=spread,
+        noise=noise,
+        aggregate=costs.total,
+        **pieces,
     )
     seen = covs[1:] + np.diag((noise.cost * std) ** 2)
     np.testing.assert_allclose(value, sum(map(spread, means[1:], seen)), rtol=1e-9)
@@ -324,12 +334,12 @@ def linear_search(plant):
     start = (jnp.asarray(plant.mean), jnp.diag(jnp.asarray(plant.std**2)))
 
     def value(gain, belief, std):
-        return belief * pilco.objective(
+        return belief * search.objective(
             gain, None, start, std, horizon=plant.horizon, **linear_pieces(plant),
             expected_cost=lambda mean, cov: mean @ plant.q @ mean + jnp.trace(plant.q @ cov),
         )  # fmt: skip
 
-    searcher = pilco.analytic(value, lambda key, belief: jnp.zeros(len(plant.mean)))
+    searcher = search.analytic(value, lambda key, belief: jnp.zeros(len(plant.mean)))
     return searcher, jax.jit(searcher.run, static_argnames="steps")
 
 
@@ -382,7 +392,7 @@ def test_the_search_stays_where_the_objective_is_finite():
     def value(x, belief, std):
         return -x + jnp.where(x > 0.5, jnp.nan, 0.0) * x
 
-    searcher = pilco.analytic(value, lambda key, belief: jnp.zeros(1))
+    searcher = search.analytic(value, lambda key, belief: jnp.zeros(1))
     start = jnp.zeros(())
     learner, info = jax.jit(partial(searcher.run, steps=20))(
         jax.random.key(0), Learner(start, searcher.init(start)), None, first=0

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 from pegasus_envs import mjcf
-from pegasus_jax import settings
-from pegasus_jax.build import build
-from pegasus_jax.report.play import HEIGHT, STRIP, WIDTH, composed, performance, pictures, strip
+from pegasus_jax.builder import build
+from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import make
 from pegasus_jax.types import Trajectory
+from pegasus_jax.viz.video import HEIGHT, STRIP, WIDTH, composed, performance, pictures, strip
 from test_train import call
 
 TINY = ["task=cartpole", "model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "trials=1"]
@@ -60,7 +60,7 @@ def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
         assert mjcf.read(tmp_path / "arm.xml").na == (name == "arm_with_state")
         plant = {"mjcf": str(tmp_path / "arm.xml"), "cost": "jax.numpy:sum", "dt": ".04", "horizon": "2"}
         words |= {"task": "mjcf", **plant}
-    experiment = build(settings.parse(words))
+    experiment = build(config_io.parse(words))
     params = experiment.init(jax.random.key(0)).policy.params
     task = experiment.task._replace(horizon=2, cost=lambda x: x[0])
     perform = jax.jit(partial(performance, task=task, policy=experiment.policy, mean=True))

@@ -11,12 +11,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from pegasus_jax import dropout
-from pegasus_jax.angles import encode
-from pegasus_jax.policy.linear import linear
-from pegasus_jax.policy.rbf import rbf
-from pegasus_jax.policy.scaled import inherited, scaled
-from pegasus_jax.policy.squash import SQUASHES, sine, to_limits
+from pegasus_jax.math.angles import encode
+from pegasus_jax.models import dropout
+from pegasus_jax.pilco.rbf import rbf
+from pegasus_jax.policies.linear import linear
+from pegasus_jax.policies.scaled import inherited, scaled
+from pegasus_jax.policies.squash import SQUASHES, sine, to_limits
 from probes import LIMITS, controller, experience, same
 
 every_squash = pytest.mark.parametrize("squash", SQUASHES)

@@ -10,10 +10,10 @@ import optax
 import pytest
 
 from pegasus_jax import config
-from pegasus_jax.build import compose
+from pegasus_jax.builder import compose
 from pegasus_jax.checks import SettingError
-from pegasus_jax.population import best_of
-from pegasus_jax.search import SearchInfo
+from pegasus_jax.learn.multistart import best_of
+from pegasus_jax.learn.search import SearchInfo
 from pegasus_jax.types import Learner, Searcher
 from probes import cart, noisy_linear_policy, regression, same, tiny, unchecked
 

@@ -15,9 +15,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from pegasus_jax import progress
-from pegasus_jax.progress import Clock, Display, announcement, best_line, duration, stopped, summary
-from pegasus_jax.settings import parse
+from pegasus_jax.runs import display as progress
+from pegasus_jax.runs.config_io import parse
+from pegasus_jax.runs.display import Clock, Display, announcement, best_line, duration, stopped, summary
 
 ROW: dict[str, Any] = {
     "trial": 7,

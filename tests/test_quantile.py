@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from pegasus_jax.quantile import erf_inv, uniforms
+from pegasus_jax.math.quantile import erf_inv, uniforms
 
 MANY = 100_000
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from folders import a_run, episode, row
-from pegasus_jax import files, record
 from pegasus_jax.checks import RunError, SettingError
-from pegasus_jax.record import best_trial
+from pegasus_jax.runs import files, store
+from pegasus_jax.runs.store import best_trial
 
 
 @pytest.fixture(scope="module")
@@ -62,32 +62,30 @@ def test_a_write_that_fails_leaves_what_was_there(tmp_path: Path) -> None:
 
 
 def test_json_has_null_for_what_is_no_number(run: Path) -> None:
-    record.write_trials(
-        run, [row(1, episode_cost=float("nan"), seconds={"fit": float("inf")}, calibration=[1, np.nan])]
-    )
+    store.write_trials(run, [row(1, episode_cost=float("nan"), seconds={"fit": float("inf")}, calibration=[1, np.nan])])
     text = (run / "trials.jsonl").read_text()
     told = json.loads(text, parse_constant=lambda name: pytest.fail(name))
     assert (told["episode_cost"], told["seconds"], told["calibration"]) == (None, {"fit": None}, [1, None])
 
 
 def test_an_episode_is_read_back_with_who_ran_it(run: Path) -> None:
-    task = record.task_of(run)
+    task = store.task_of(run)
     for trial, length, policy, ended in ((4, 7, 2, "terminated"), (5, 0, 0, "interrupted"), (6, 25, 5, "horizon")):
         one = episode(task, trial)._replace(length=np.int32(length))
-        record.save_episode(run, trial, one, task, policy=policy, ended=ended)
-        other = record.load_episode(run, trial)
+        store.save_episode(run, trial, one, task, policy=policy, ended=ended)
+        other = store.load_episode(run, trial)
         assert other is not None
         assert other.ended == ended
         np.testing.assert_array_equal(other.trajectory.x, one.x[: length + 1])
         np.testing.assert_array_equal(other.trajectory.u, one.u[:length])
         np.testing.assert_array_equal(other.trajectory.cost, one.cost[:length])
-        assert record.origin(run, trial) == (policy, ended)
-    assert (record.load_episode(run, 7), record.origin(run, 7)) == (None, None)
+        assert store.origin(run, trial) == (policy, ended)
+    assert (store.load_episode(run, 7), store.origin(run, 7)) == (None, None)
 
 
 def wrong_episodes(run: Path) -> dict[str, dict[str, Any]]:
     """What is put in the place of some arrays of an episode that is right otherwise."""
-    with np.load(record.episode_path(run, 2)) as file:
+    with np.load(store.episode_path(run, 2)) as file:
         x, u, cost = (file[name] for name in ("x", "u", "cost"))
     far, nan = u.copy(), x.copy()
     far[3], nan[3, 1] = 10.5, np.nan
@@ -119,29 +117,29 @@ def wrong_episodes(run: Path) -> dict[str, dict[str, Any]]:
 
 
 def test_an_episode_that_cannot_be_is_one_line(run: Path) -> None:
-    path = record.episode_path(run, 2)
+    path = store.episode_path(run, 2)
     with np.load(path) as file:
         whole = dict(file)
     for name, changes in wrong_episodes(run).items():
         arrays = {key: value for key, value in (whole | changes).items() if value is not None}
         np.savez(path, **arrays)
-        assert str(path) in refused(record.load_episode, run, 2), name
+        assert str(path) in refused(store.load_episode, run, 2), name
 
 
 def test_a_file_that_is_no_episode_is_one_line(run: Path) -> None:
-    path = record.episode_path(run, 2)
+    path = store.episode_path(run, 2)
     whole, array = path.read_bytes(), io.BytesIO()
     np.save(array, np.zeros(3))
     for content in (b"", b"no episode", array.getvalue(), whole[:-100], whole[:60], bytes(len(whole)), os.urandom(500)):
         path.write_bytes(content)
-        assert "it is damaged, or no .npz file" in refused(record.load_episode, run, 2)
+        assert "it is damaged, or no .npz file" in refused(store.load_episode, run, 2)
     for place in range(30, len(whole), len(whole) // 40):  # a flipped bit is seen, or changes no number
         path.write_bytes(whole[:place] + bytes([whole[place] ^ 1]) + whole[place + 1 :])
         with suppress(RunError):
-            record.load_episode(run, 2)
+            store.load_episode(run, 2)
     path.unlink()
     path.mkdir()
-    assert "cannot be read" in refused(record.load_episode, run, 2)
+    assert "cannot be read" in refused(store.load_episode, run, 2)
 
 
 ROWS = [json.dumps(row(trial)) for trial in (1, 2, 3)]
@@ -162,9 +160,9 @@ DAMAGED_ROWS = {
 def test_rows_that_cannot_be_are_named(run: Path, name: str) -> None:
     lines, whole = DAMAGED_ROWS[name]
     (run / "trials.jsonl").write_bytes("".join(f"{line}\n" for line in lines).encode("latin1"))
-    said = refused(record.trials, run)
+    said = refused(store.trials, run)
     assert f"trials.jsonl line {whole + 1} " in said
-    rows, problem = record.readable_trials(run)
+    rows, problem = store.readable_trials(run)
     assert [row["trial"] for row in rows] == list(range(1, whole + 1))
     assert problem is not None
     assert problem in said
@@ -173,7 +171,7 @@ def test_rows_that_cannot_be_are_named(run: Path, name: str) -> None:
 @pytest.mark.parametrize("content", [b"", b"{", b"[]", b"null", b'{"commands": 3}', b"\xff", b'{"task": {"name": 3}}'])
 def test_a_damaged_run_json_is_named(run: Path, content: bytes) -> None:
     (run / "run.json").write_bytes(content)
-    said = refused(record.task_of, run)
+    said = refused(store.task_of, run)
     assert "run.json is damaged" in said or "noted no facts of its task" in said
 
 
@@ -181,25 +179,25 @@ def test_a_run_of_an_older_version_says_which(run: Path) -> None:
     told = json.loads((run / "run.json").read_text())
     del told["task"]
     (run / "run.json").write_text(json.dumps(told | {"versions": {"pegasus-jax": "0.0.7"}}))
-    assert "was made by pegasus-jax 0.0.7" in refused(record.load_episode, run, 1)
+    assert "was made by pegasus-jax 0.0.7" in refused(store.load_episode, run, 1)
 
 
-@pytest.mark.parametrize("name", [*record.FILES, *record.FOLDERS])
+@pytest.mark.parametrize("name", [*store.FILES, *store.FOLDERS])
 def test_a_file_for_a_folder_or_the_reverse_is_named(run: Path, name: str) -> None:
     path = run / name
-    if name in record.FOLDERS:
+    if name in store.FOLDERS:
         shutil.rmtree(path, ignore_errors=True)
         path.write_text("")
     else:
         path.unlink(missing_ok=True)
         path.mkdir()
-    assert f"{name} is not a f" in refused(record.existing, run)
+    assert f"{name} is not a f" in refused(store.existing, run)
 
 
 def test_copies_are_not_counted(run: Path) -> None:
     for name in ("0003 (copy).json", "0003.json.bak", "3.json", "²³.json", "00003.json"):
         (run / "checkpoints" / name).write_text("{}")
-    assert record.numbered(run / "checkpoints", ".json") == [1, 2, 3]
+    assert store.numbered(run / "checkpoints", ".json") == [1, 2, 3]
 
 
 def test_left_over_files_go_and_no_others(run: Path) -> None:
@@ -218,26 +216,26 @@ def test_left_over_files_go_and_no_others(run: Path) -> None:
         for path in run.rglob("*")
         if "half" not in (path.read_bytes()[:4].decode("latin1") if path.is_file() else "")
     }
-    record.remove_unfinished(run)
+    store.remove_unfinished(run)
     assert {*run.rglob("*")} == before
 
 
 def test_a_folder_is_taken_once(made: Path, tmp_path: Path) -> None:
     """Two processes have both made it; the first finishes before the second asks for the lock."""
-    record.create(tmp_path / "run")
-    record.create(tmp_path / "run")
-    with record.lock(tmp_path / "run", new=True):
+    store.create(tmp_path / "run")
+    store.create(tmp_path / "run")
+    with store.lock(tmp_path / "run", new=True):
         with pytest.raises(RunError, match="another process"):
-            record.lock(tmp_path / "run", new=True)
+            store.lock(tmp_path / "run", new=True)
         shutil.copy(made / "config.yaml", tmp_path / "run")
     with pytest.raises(SettingError, match="holds a run already"):
-        record.lock(tmp_path / "run", new=True)
-    with record.lock(tmp_path / "run"):
+        store.lock(tmp_path / "run", new=True)
+    with store.lock(tmp_path / "run"):
         pass
     (tmp_path / "run" / "config.yaml").unlink()
     shutil.copytree(made / "episodes", tmp_path / "run" / "episodes")
     with pytest.raises(SettingError, match="holds episodes of a run without"):
-        record.create(tmp_path / "run")
+        store.create(tmp_path / "run")
 
 
 def measured(*pairs: tuple[float, float]) -> list[dict[str, Any]]:

@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from folders import a_run
-from pegasus_jax import checkpoint, record, restore, settings, tasks
-from pegasus_jax.build import build
+from pegasus_jax import tasks
+from pegasus_jax.builder import build
 from pegasus_jax.checks import RunError, SettingError
+from pegasus_jax.runs import checkpoint, config_io, restore, store
 from test_train import call
 
 
@@ -27,8 +28,10 @@ def run(made: Path, tmp_path: Path) -> Path:
 
 
 def change(run: Path, **changes: object) -> None:
-    config = settings.load(run / "config.yaml")
-    settings.save(settings.override(config, {k.replace("__", "."): v for k, v in changes.items()}), run / "config.yaml")
+    config = config_io.load(run / "config.yaml")
+    config_io.save(
+        config_io.override(config, {k.replace("__", "."): v for k, v in changes.items()}), run / "config.yaml"
+    )
 
 
 def test_the_facts_of_a_task_make_the_same_experiment(run: Path) -> None:
@@ -53,7 +56,7 @@ def test_a_state_of_other_settings_is_refused_with_the_difference(run: Path) -> 
         restore.restored(run)
     change(run, model__hidden=[3], task="double_cartpole")
     with pytest.raises(RunError, match="is not that of run"):
-        restore.planted(run, settings.load(run / "config.yaml"))
+        restore.planted(run, config_io.load(run / "config.yaml"))
 
 
 def test_another_optimiser_leaves_what_was_learned(run: Path) -> None:
@@ -85,9 +88,9 @@ def test_damaged_checkpoints_are_named(run: Path) -> None:
 
 def test_a_run_goes_on_from_where_its_rows_end(run: Path) -> None:
     """Rows that checkpoints prove are not lost: their trials are done again, and that is said."""
-    experiment = build(settings.load(run / "config.yaml"))
+    experiment = build(config_io.load(run / "config.yaml"))
     for lines, begins in (([0, 1, 2], 3), ([0, 1], 2), ([0, 2], 1), ([0, 0, 1, 2], 1), ([], None)):
-        whole = [json.dumps(row) for row in record.trials(run)]
+        whole = [json.dumps(row) for row in store.trials(run)]
         (run / "trials.jsonl").write_text("".join(whole[i] + "\n" for i in lines))
         said: list[str] = []
         state = restore.together([run], experiment, said.append)
@@ -100,16 +103,16 @@ def test_a_run_goes_on_from_where_its_rows_end(run: Path) -> None:
 def test_the_last_episode_counts_though_it_has_no_row(run: Path) -> None:
     """The policy after the last trial is the best as soon as its own episode says so."""
     assert restore.best(run) == 2
-    task, cheap = record.task_of(run), record.load_episode(run, 3)
+    task, cheap = store.task_of(run), store.load_episode(run, 3)
     assert cheap is not None
     good = cheap.trajectory._replace(cost=0.01 * cheap.trajectory.cost)
-    record.save_episode(run, 4, good, task, policy=3, ended="horizon")
+    store.save_episode(run, 4, good, task, policy=3, ended="horizon")
     assert restore.best(run) == 3
-    record.save_episode(run, 4, good, task, policy=3, ended="error")
+    store.save_episode(run, 4, good, task, policy=3, ended="error")
     assert restore.best(run) == 2
     # One that ended early pays for what it left out.
     short = good._replace(x=good.x[:3], u=good.u[:2], cost=good.cost[:2])
-    record.save_episode(run, 4, short, task, policy=3, ended="terminated")
+    store.save_episode(run, 4, short, task, policy=3, ended="terminated")
     assert restore.best(run) == 2
 
 
@@ -118,11 +121,11 @@ def test_nothing_is_imported_from_inside_a_run(run: Path, monkeypatch: pytest.Mo
     for folder in (run, run / "lib"):
         folder.mkdir(exist_ok=True)
         (folder / "evil.py").write_text("raise SystemExit('executed')")
-    config = settings.override(settings.load(run / "config.yaml"), {"task": "gym", "cost": "run.lib.evil:cost"})
+    config = config_io.override(config_io.load(run / "config.yaml"), {"task": "gym", "cost": "run.lib.evil:cost"})
     monkeypatch.chdir(run.parent)
     with pytest.raises(RunError, match="nothing is imported from there"):
         restore.announce(Path("run"), config)
-    config = settings.override(config, {"cost": "evil:cost"})
+    config = config_io.override(config, {"cost": "evil:cost"})
     restore.announce(run, config)
     monkeypatch.syspath_prepend(run / "lib")
     with pytest.raises(RunError, match="nothing is imported from there"):
@@ -170,11 +173,11 @@ def test_a_model_that_was_moved_is_known_by_its_content(tmp_path: Path, monkeypa
     (tmp_path / "up.py").write_text("import jax.numpy as jnp\ncost = lambda x: 1 - jnp.exp(-x[0] ** 2)\n")
     monkeypatch.chdir(tmp_path)
     words = {"task": "mjcf", "mjcf": str(tmp_path / "arm.xml"), "cost": "up:cost", "dt": "0.05", "horizon": "6"}
-    config = settings.parse(words)
+    config = config_io.parse(words)
     run = a_run(tmp_path / "run", made=tasks.of_config(config), **words)
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "arm.xml").rename(tmp_path / "elsewhere" / "new.xml")
-    kept = settings.load(run / "config.yaml")
+    kept = config_io.load(run / "config.yaml")
     with pytest.raises(RunError, match="is not there; mjcf=FILE says where it is now"):
         restore.moved(run, kept)
     now = restore.moved(run, kept, "elsewhere/new.xml")
@@ -186,4 +189,4 @@ def test_a_model_that_was_moved_is_known_by_its_content(tmp_path: Path, monkeypa
     with pytest.raises(RunError, match="its mjcf_digest was"):
         restore.planted(run, now)
     with pytest.raises(SettingError, match="of no use here"):
-        restore.moved(run, settings.parse({"task": "cartpole"}), "new.xml")
+        restore.moved(run, config_io.parse({"task": "cartpole"}), "new.xml")

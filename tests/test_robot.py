@@ -15,12 +15,14 @@ import numpy as np
 import pytest
 
 from pegasus_envs.gym_plant import env_spec
-from pegasus_jax import controller, record, settings, study
+from pegasus_jax import controller
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
-from pegasus_jax.record import RunError
-from pegasus_jax.report.curves import seeds_picture
-from pegasus_jax.restore import restored
+from pegasus_jax.runs import config_io, store
+from pegasus_jax.runs.restore import restored
+from pegasus_jax.runs.store import RunError
+from pegasus_jax.studies import study
+from pegasus_jax.viz.learning_curves import seeds_picture
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "extending.md").read_text(), re.DOTALL)
@@ -92,7 +94,7 @@ def test_a_robot_moves_for_the_episodes_that_are_data_and_for_nothing_else(learn
     """One reset to check it, a reset and a horizon of steps a trial; going on opens it again, a look at the run not."""
     trial = ["reset", *["step"] * 5]
     assert asked(learned) == ["reset", *trial, *trial, "close"]
-    rows = record.trials(learned / "run")
+    rows = store.trials(learned / "run")
     assert [(row["mean_cost"], row["success_rate"]) for row in rows] == [(None, None)] * 2
     assert all(0 <= row["episode_cost"] <= 1 for row in rows)
     code, out, err = call("plot", "run", cwd=learned)
@@ -131,13 +133,13 @@ def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None
         err.splitlines()[-1],
     )
     assert asked(tmp_path) == ["reset", "reset", *["step"] * 5, "reset", *["step"] * 3, "close"]
-    cut = record.load_episode(tmp_path / "run", 2)
+    cut = store.load_episode(tmp_path / "run", 2)
     assert cut is not None
     assert (cut.ended, cut.trajectory.x.shape, cut.trajectory.u.shape) == ("error", (3, 2), (2, 1))
     code, _, err = call("train", "resume=run", "final=true", cwd=tmp_path)
     # The episode that was cut short is learned from; the last policy's own is the only one that moves the robot.
     assert (code, asked(tmp_path)) == (0, ["reset", *["step"] * 5, "close"]), err
-    assert [(row["steps"], row["ended"], row["policy"]) for row in record.trials(tmp_path / "run")] == [
+    assert [(row["steps"], row["ended"], row["policy"]) for row in store.trials(tmp_path / "run")] == [
         (5, "horizon", 0),
         (2, "error", 1),
     ]
@@ -206,4 +208,4 @@ def test_runs_that_were_not_evaluated_have_no_curves_to_compare(learned: Path) -
         seeds_picture([learned / "run"], learned / "learning.png")
     with pytest.raises(SettingError, match="evaluation=0"):
         study.study(Config(evaluation=0), [0])
-    assert settings.load(learned / "run" / "config.yaml").start_mean == (3.14, 0.0)
+    assert config_io.load(learned / "run" / "config.yaml").start_mean == (3.14, 0.0)

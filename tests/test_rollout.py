@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax import moments
-from pegasus_jax.rollout import UNROLL, NoiseUse, limited, rollout
-from pegasus_jax.scenarios import draw
+from pegasus_jax.imagine import matching
+from pegasus_jax.imagine.rollout import UNROLL, NoiseUse, limited, rollout
+from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.types import Dynamics, Period, Policy, Prediction, Scenarios
 from probes import PENDULUM, Linear, known, linear_policy, rig
 
 K, H, D = 7, 4, 3
-MATCHES = {"match": moments.match, "keep": moments.keep}
+MATCHES = {"match": matching.match, "keep": matching.keep}
 NOISE = NoiseUse(policy=0.7, state=0.4, cost=0.5)
 every_match = pytest.mark.parametrize("match", MATCHES)
 seeds = st.integers(0, 2**16)
@@ -73,7 +73,7 @@ def test_an_unrolled_loop_is_the_loop(jitted, monkeypatch):
 
     def value(params):
         rolled = rollout(
-            params, r.belief, given, dynamics=r.dynamics, policy=r.policy, match=moments.match, noise=NOISE
+            params, r.belief, given, dynamics=r.dynamics, policy=r.policy, match=matching.match, noise=NOISE
         )
         return sum(jnp.sum(jnp.sin(leaf)) for leaf in rolled)
 
@@ -95,7 +95,7 @@ def test_the_same_scenarios_give_the_same_bits(jitted, seed):
 
 def test_k_particles_are_k_rollouts_of_one(jitted):
     r, given = rig(K, H), jitted[0](5)
-    alone = jax.jit(partial(rollout, dynamics=r.dynamics, policy=r.policy, match=moments.keep, noise=NOISE))
+    alone = jax.jit(partial(rollout, dynamics=r.dynamics, policy=r.policy, match=matching.keep, noise=NOISE))
     together = jitted[1](given, "keep")
     for k in range(K):
         one = slice(k, k + 1)
@@ -160,7 +160,7 @@ def controller(apply):
 def test_a_particle_holds_its_draws_for_the_whole_trajectory():
     dynamics = model(lambda belief, draw, x, u: Prediction(draw, jnp.zeros(2)))
     policy = controller(lambda params, noise, x: noise[None])
-    imagined = rollout(None, None, CONSTANT, dynamics=dynamics, policy=policy, match=moments.keep)
+    imagined = rollout(None, None, CONSTANT, dynamics=dynamics, policy=policy, match=matching.keep)
     steps = np.diff(imagined.x, axis=0)
     np.testing.assert_allclose(steps, np.broadcast_to(CONSTANT.dynamics, (5, 3, 2)), atol=1e-5)
     assert np.array_equal(imagined.u[..., 0], np.broadcast_to(CONSTANT.policy, (5, 3)))
@@ -170,7 +170,7 @@ def test_a_particle_holds_its_draws_for_the_whole_trajectory():
 def test_a_model_of_all_particles_at_once_is_taken_for_the_model_of_one():
     one = model(lambda belief, draw, x, u: Prediction(draw, jnp.zeros(2)))
     many = one._replace(particles=lambda apply: lambda belief, draws, x, u: Prediction(draws[::-1], jnp.zeros((3, 2))))
-    pieces = dict(policy=controller(lambda params, noise, x: noise[None]), match=moments.keep)
+    pieces = dict(policy=controller(lambda params, noise, x: noise[None]), match=matching.keep)
     steps = [np.diff(rollout(None, None, CONSTANT, dynamics=d, **pieces).x, axis=0) for d in (one, many)]
     np.testing.assert_allclose(steps[0], steps[1][:, ::-1], atol=1e-5)
 
@@ -192,7 +192,7 @@ def test_noise_factors_do_what_they_say(policy_factor, state_factor, cost_factor
 def STILL(noise, std):
     dynamics = model(lambda belief, draw, x, u: Prediction(jnp.zeros(2), std))
     policy = controller(lambda params, noise, x: x)
-    return rollout(None, None, CONSTANT, dynamics=dynamics, policy=policy, match=moments.keep, noise=noise)
+    return rollout(None, None, CONSTANT, dynamics=dynamics, policy=policy, match=matching.keep, noise=noise)
 
 
 def test_the_default_is_the_authors_noise_on_the_policy_input_alone():
@@ -207,7 +207,7 @@ def test_no_gradient_flows_through_the_predicted_noise(factor):
 
     def loss(params, through_mean):
         dynamics = model(lambda belief, draw, x, u: Prediction(through_mean * u[:1] * jnp.ones(2), (u[0] * x) ** 2))
-        imagined = rollout(params, None, CONSTANT, dynamics=dynamics, policy=policy, match=moments.keep, noise=noise)
+        imagined = rollout(params, None, CONSTANT, dynamics=dynamics, policy=policy, match=matching.keep, noise=noise)
         return jnp.sum(imagined.seen**2) + jnp.sum(imagined.u[..., 1] ** 2)
 
     value, gradient = jax.jit(loss), jax.jit(jax.grad(loss))
@@ -227,7 +227,7 @@ def truncated(truncate):
     given = Scenarios(jax.random.normal(jax.random.key(0), (3, 2)), jnp.zeros(3), jnp.zeros(3), none, none)
 
     def value(gain):
-        x = rollout(gain, None, given, dynamics=dynamics, policy=policy, match=moments.keep, truncate=truncate).x
+        x = rollout(gain, None, given, dynamics=dynamics, policy=policy, match=matching.keep, truncate=truncate).x
         return jnp.mean(x[1:] ** 2), x
 
     gain = jnp.array([[-0.4, -1.1]])
@@ -270,7 +270,7 @@ def limited_at(start, limit):
     given = Scenarios(jnp.asarray(start), jnp.zeros(k), jnp.zeros(k), none, none)
 
     def value(gain):
-        x = rollout(gain, None, given, dynamics=dynamics, policy=policy, match=moments.keep, limit=limit).x
+        x = rollout(gain, None, given, dynamics=dynamics, policy=policy, match=matching.keep, limit=limit).x
         return jnp.mean(x[1:]), x
 
     gradient, x = jax.jit(jax.grad(value, has_aux=True))(jnp.zeros((1, 1)))

@@ -7,9 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax import config, config_models, settings
+from pegasus_jax import config, config_models
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
+from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import TASKS
 from pegasus_jax.variants import ALGORITHMS
 from test_settings import parse
@@ -69,8 +70,8 @@ configs = st.builds(
 @given(chosen=configs)
 def test_a_saved_config_is_loaded_to_the_last_bit(chosen, tmp_path_factory):
     path = tmp_path_factory.mktemp("config") / "config.yaml"
-    settings.save(chosen, path)
-    assert settings.load(path) == chosen
+    config_io.save(chosen, path)
+    assert config_io.load(path) == chosen
 
 
 NO_CONFIGS = {
@@ -90,37 +91,37 @@ def test_a_file_that_is_no_config_says_so(name, tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(NO_CONFIGS[name], encoding="utf-8")
     with pytest.raises(SettingError) as caught:
-        settings.load(path)
+        config_io.load(path)
     assert len(str(caught.value).splitlines()) == 1
 
 
 def test_a_missing_config_says_so(tmp_path):
     with pytest.raises(SettingError, match=r"config\.yaml"):
-        settings.load(tmp_path / "config.yaml")
+        config_io.load(tmp_path / "config.yaml")
 
 
 def test_a_run_from_before_a_setting_existed_goes_on_with_its_default(tmp_path):
     chosen = parse("search.steps=70", "seed=7")
-    settings.save(chosen, tmp_path / "config.yaml")
+    config_io.save(chosen, tmp_path / "config.yaml")
     lines = (tmp_path / "config.yaml").read_text().splitlines()
     older = [line for line in lines if "search.reheat" not in line and "fit.decay" not in line]
     assert len(older) == len(lines) - 2
     (tmp_path / "config.yaml").write_text("\n".join(older), encoding="utf-8")
-    assert settings.load(tmp_path / "config.yaml") == chosen
+    assert config_io.load(tmp_path / "config.yaml") == chosen
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_what_was_parsed_survives_the_file(algorithm, tmp_path):
     chosen = parse(f"algorithm={algorithm}", "model=sparse", "policy=mlp", "policy.hidden=[3]", "seed=7")
-    settings.save(chosen, tmp_path / "config.yaml")
-    loaded = settings.load(tmp_path / "config.yaml")
+    config_io.save(chosen, tmp_path / "config.yaml")
+    loaded = config_io.load(tmp_path / "config.yaml")
     assert loaded == chosen
     assert hash(loaded) == hash(chosen)
-    assert jax.tree.leaves(settings.override(loaded, {"trials": 20}).trials) == [20]
+    assert jax.tree.leaves(config_io.override(loaded, {"trials": 20}).trials) == [20]
 
 
 @pytest.mark.parametrize("ends", [(1.0, 5.0), (-20.0, -12.0)])
 def test_any_interval_survives_the_file(ends, tmp_path):
     chosen = Config(model=BNN(low=ends[0], high=ends[1]))
-    settings.save(chosen, tmp_path / "config.yaml")
-    assert settings.load(tmp_path / "config.yaml") == chosen
+    config_io.save(chosen, tmp_path / "config.yaml")
+    assert config_io.load(tmp_path / "config.yaml") == chosen

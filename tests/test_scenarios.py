@@ -9,8 +9,8 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from pegasus_jax import scenarios
-from pegasus_jax.moments import standardise
+from pegasus_jax.imagine import scenarios
+from pegasus_jax.math.linalg import standardise
 from pegasus_jax.types import Period, Scenarios
 from probes import rig, same
 

@@ -11,11 +11,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
-from pegasus_jax import cost, moments, scenarios
-from pegasus_jax.course import Course, narrowing
-from pegasus_jax.fit import guarded
-from pegasus_jax.rollout import NoiseUse
-from pegasus_jax.search import keeping_best, objective, optimise, remembering, started
+from pegasus_jax.imagine import costs, matching, scenarios
+from pegasus_jax.imagine.rollout import NoiseUse
+from pegasus_jax.learn.fit import guarded
+from pegasus_jax.learn.schedule import Course, narrowing
+from pegasus_jax.learn.search import keeping_best, objective, optimise, remembering, started
 from pegasus_jax.types import Learner, Period, Scenarios, Searcher
 from probes import (
     EMITTERS,
@@ -41,7 +41,7 @@ def on_rig():
     """(seed) -> scenarios, scenarios -> (objective, gradient), compiled once."""
     r = rig()
     draw = jax.jit(lambda seed: scenarios.draw(jax.random.key(seed), 0, r.belief, blocks=r.blocks, period=Period()))
-    value = partial(objective, dynamics=r.dynamics, policy=r.policy, match=moments.match, cost=r.cost)
+    value = partial(objective, dynamics=r.dynamics, policy=r.policy, match=matching.match, cost=r.cost)
     gradient = jax.jit(jax.value_and_grad(value))
     return draw, lambda given: gradient(r.params, r.belief, given)
 
@@ -74,7 +74,9 @@ def test_the_gradient_equals_finite_differences(x64):
     gradient is meant to flow through a predicted one."""
     r = make_rig(particles=7, horizon=4, heteroscedastic=False)
     given = jax.jit(lambda k: scenarios.draw(k, 0, r.belief, blocks=r.blocks, period=Period()))(jax.random.key(0))
-    pieces = dict(dynamics=r.dynamics, policy=r.policy, match=moments.match, cost=r.cost, noise=NoiseUse(1.0, 0.5, 0.5))
+    pieces = dict(
+        dynamics=r.dynamics, policy=r.policy, match=matching.match, cost=r.cost, noise=NoiseUse(1.0, 0.5, 0.5)
+    )
     value = jax.jit(partial(objective, **pieces))
     gradient = jax.jit(jax.grad(partial(objective, **pieces)))(r.params, r.belief, given)
     for seed in range(4):
@@ -105,8 +107,8 @@ def linear_objective(plant, particles):
         objective,
         dynamics=dynamics,
         policy=policy,
-        match=moments.match,
-        cost=cost.of_particles(lambda x: x @ jnp.asarray(plant.q, x.dtype) @ x),
+        match=matching.match,
+        cost=costs.of_particles(lambda x: x @ jnp.asarray(plant.q, x.dtype) @ x),
     )
     return value, blocks
 
@@ -319,7 +321,9 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
         balanced=False,
     )
     pieces = dict(blocks=blocks, period=Period(start=1, sensor=3))  # redrawn inside a piece and across two
-    value = partial(objective, dynamics=dynamics, policy=policy, match=moments.match, cost=cost.of_particles(task.cost))
+    value = partial(
+        objective, dynamics=dynamics, policy=policy, match=matching.match, cost=costs.of_particles(task.cost)
+    )
     optimizer = guarded(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.01)))
 
     def search(steps):

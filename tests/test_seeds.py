@@ -16,10 +16,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax import machine, record
-from pegasus_jax import program as programs
-from pegasus_jax.build import compose
-from pegasus_jax.program import Program, over_seeds
+from pegasus_jax.builder import compose
+from pegasus_jax.runs import machine, programs, store
+from pegasus_jax.runs.programs import Program, over_seeds
 from probes import EMITTERS, cart, tiny, unchecked
 from test_train import TINY, call, fingerprint, program
 
@@ -48,13 +47,13 @@ def test_a_seed_among_others_leaves_what_it_leaves_alone(study: Path, tmp_path: 
     assert files[0] == files[1]
     assert (alone / "config.yaml").read_text() == (among / "config.yaml").read_text()
     for trial in (1, 2):
-        one, other = record.load_episode(alone, trial), record.load_episode(among, trial)
+        one, other = store.load_episode(alone, trial), store.load_episode(among, trial)
         assert one is not None
         assert other is not None
         for a, b in zip(one.trajectory[:3], other.trajectory[:3], strict=True):
             # Rounding, amplified by learning and by the plant: forces are up to 10 N, rates up to ten radians a second.
             np.testing.assert_allclose(a, b, rtol=1e-3, atol=5e-3)
-    for a, b in zip(record.trials(alone), record.trials(among), strict=True):
+    for a, b in zip(store.trials(alone), store.trials(among), strict=True):
         assert a.keys() == b.keys()
         for name in ("mean_cost", "objective_first", "objective_last", "objective_fresh"):
             assert a[name] == pytest.approx(b[name], abs=2e-4), name
@@ -151,13 +150,13 @@ def test_killed_and_resumed_is_bit_equal(study: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     for seed in ("seed1", "seed2"):
         assert fingerprint(folder / seed) == fingerprint(study / seed)
-        assert [row["trial"] for row in record.trials(folder / seed)] == [1, 2]
+        assert [row["trial"] for row in store.trials(folder / seed)] == [1, 2]
 
 
 def alike(study: Path, other: Path) -> None:
     """Two folders of seeds hold the same runs, up to the order of sums."""
     for seed in ("seed1", "seed2"):
-        for a, b in zip(record.trials(study / seed), record.trials(other / seed), strict=True):
+        for a, b in zip(store.trials(study / seed), store.trials(other / seed), strict=True):
             for name in ("mean_cost", "objective_first", "objective_last", "objective_fresh"):
                 assert a[name] == pytest.approx(b[name], abs=2e-4), (seed, name)
 

@@ -6,19 +6,19 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax import settings
-from pegasus_jax.build import compose
+from pegasus_jax.builder import compose
 from pegasus_jax.checks import SettingError, shown
 from pegasus_jax.config import BNN, RBF, Analytic, Config, Lagrangian, Period, Search
 from pegasus_jax.defaults import defaults
+from pegasus_jax.runs import config_io
 from pegasus_jax.variants import KINDS, MODELS, POLICIES
 from probes import cart
 
 
 def parse(*words):
     """The config of these words, with the general model where they name none."""
-    _, rest = settings.split(words, ("out", "resume"))
-    return settings.parse({"model": "log_normal", **rest}, options=("out", "resume"))
+    _, rest = config_io.split(words, ("out", "resume"))
+    return config_io.parse({"model": "log_normal", **rest}, options=("out", "resume"))
 
 
 # What the cart-pole's words begin with: all defaults but those of its search.
@@ -26,7 +26,7 @@ CARTPOLE = Config(search=Search(balanced=True, widen=2.0, refine=0.5))
 
 
 def value(chosen, key):
-    return settings.leaves(chosen)[key]
+    return config_io.leaves(chosen)[key]
 
 
 # The spellings of the issue and of the help text
@@ -83,8 +83,8 @@ SPELLINGS = [
 
 @pytest.mark.parametrize(("word", "key", "expected"), SPELLINGS)
 def test_a_setting_changes_itself_and_nothing_else(word, key, expected):
-    users = settings.used_by().get(key, ("cartpole",))
-    chosen, default = (settings.leaves(parse(f"task={users[0]}", *words)) for words in ([word], []))
+    users = config_io.used_by().get(key, ("cartpole",))
+    chosen, default = (config_io.leaves(parse(f"task={users[0]}", *words)) for words in ([word], []))
     assert chosen[key] == expected
     assert type(chosen[key]) is type(expected)
     assert {k: v for k, v in chosen.items() if k != key} == {k: v for k, v in default.items() if k != key}
@@ -95,36 +95,36 @@ def test_no_word_gives_the_defaults():
 
 
 def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorithms():
-    own = settings.parse({})
+    own = config_io.parse({})
     assert own.model == Lagrangian(substeps=1)
-    named = settings.parse({"task": "cartpole", "model": "lagrangian", "algorithm": "pegasus"})
+    named = config_io.parse({"task": "cartpole", "model": "lagrangian", "algorithm": "pegasus"})
     assert own == named
-    network = settings.parse({"task": "cartpole", "model": "log_normal"})
+    network = config_io.parse({"task": "cartpole", "model": "log_normal"})
     assert network.model == BNN()
     assert own.search == network.search == CARTPOLE.search
     for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}):
-        assert settings.parse(words) == settings.parse({"model": "log_normal", **words})
+        assert config_io.parse(words) == config_io.parse({"model": "log_normal", **words})
     swimmer = {"task": "swimmer_corkscrew"}
-    five = settings.parse({**swimmer, "model": "log_normal", "model.members": "5", "model.kl_weight": "1"})
-    assert settings.parse(swimmer) == five
+    five = config_io.parse({**swimmer, "model": "log_normal", "model.members": "5", "model.kl_weight": "1"})
+    assert config_io.parse(swimmer) == five
 
 
 def test_what_suits_a_task_best_is_the_least_of_what_is_said():
     """Where a model is named the settings chosen with another do not count; a named policy's own do, and words do."""
-    own, named = (settings.parse({"task": "double_cartpole"} | model) for model in ({}, {"model": "lagrangian"}))
+    own, named = (config_io.parse({"task": "double_cartpole"} | model) for model in ({}, {"model": "lagrangian"}))
     assert (own.model.substeps, own.search.anneal, own.search.sensors, own.explore.trials) == (4, 14, "known", 4)
     assert (own.model.hidden, own.policy.hidden, own.policy.dropout) == ((32, 32), (50,) * 4, 0)
     assert (named.model.substeps, named.search.anneal, named.explore.trials) == (2, 1, 2)
-    changed = settings.parse({"task": "double_cartpole", "policy": "dropout_mlp", "search.anneal": "3"})
+    changed = config_io.parse({"task": "double_cartpole", "policy": "dropout_mlp", "search.anneal": "3"})
     assert (changed.policy.dropout, changed.search.anneal, changed.model) == (0.1, 3, own.model)
-    assert settings.parse({"task": "double_cartpole", "policy": "rbf"}).policy == RBF()
+    assert config_io.parse({"task": "double_cartpole", "policy": "rbf"}).policy == RBF()
 
 
 def test_every_setting_has_a_spelling():
     """Its own default, written as the help text writes it, changes nothing; and the help names each."""
-    text = "\n".join(settings.help_lines(CARTPOLE))
-    for key, default in settings.leaves(CARTPOLE).items():
-        if key not in settings.used_by():
+    text = "\n".join(config_io.help_lines(CARTPOLE))
+    for key, default in config_io.leaves(CARTPOLE).items():
+        if key not in config_io.used_by():
             assert parse(f"{key}={shown(default)}") == CARTPOLE
         if key not in ("task", *(f"{section}.kind" for section in KINDS)):
             assert f"  {key}={shown(default)} " in text
@@ -141,8 +141,8 @@ def test_a_variant_is_what_it_changes(word, variant):
     sections = {name: change for name, change in variant.items() if "." not in name}
     chosen = dataclasses.replace(Config(), **sections)
     settled = {name: change for name, change in (defaults("cartpole") | variant).items() if "." in name}
-    there = {name: change for name, change in settled.items() if name in settings.leaves(chosen)}
-    assert parse(word) == settings.override(chosen, there)
+    there = {name: change for name, change in settled.items() if name in config_io.leaves(chosen)}
+    assert parse(word) == config_io.override(chosen, there)
 
 
 def test_the_task_changes_only_what_the_chosen_variant_has():
@@ -165,10 +165,10 @@ def test_the_kind_of_a_section_is_not_a_setting(section):
 @pytest.mark.parametrize("section", KINDS)
 def test_a_stored_kind_that_is_unknown_is_named(section, tmp_path):
     path = tmp_path / "config.yaml"
-    settings.save(Config(), path)
+    config_io.save(Config(), path)
     path.write_text(path.read_text().replace(f"{section}.kind: ", f"{section}.kind: un"), encoding="utf-8")
     with pytest.raises(SettingError, match=rf"{section}\.kind=un.*is unknown"):
-        settings.load(path)
+        config_io.load(path)
 
 
 def test_a_variant_brings_defaults_that_single_settings_change():
@@ -212,7 +212,7 @@ def test_pilco_brings_its_own_search_and_precision():
 
 
 def test_options_are_kept_from_the_settings():
-    known, rest = settings.split(["out=runs/a=b", "seed=3", "resume="], ("out", "resume"))
+    known, rest = config_io.split(["out=runs/a=b", "seed=3", "resume="], ("out", "resume"))
     assert known == {"out": "runs/a=b", "resume": ""}
     assert rest == {"seed": "3"}
 
@@ -335,7 +335,7 @@ def fate(word):
         return str(error).splitlines()
 
 
-@given(st.sampled_from(sorted(settings.leaves(Config()))), st.text(max_size=12))
+@given(st.sampled_from(sorted(config_io.leaves(Config()))), st.text(max_size=12))
 def test_any_text_ends_in_a_config_or_in_one_line(key, text):
     end = fate(f"{key}={text}")
     assert isinstance(end, Config) or len(end) == 1

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from pegasus_jax import kernel
-from pegasus_jax.dynamics import gp as exact
-from pegasus_jax.dynamics.ssgp import log_evidence, ssgp
+from pegasus_jax.pilco import gp as exact
+from pegasus_jax.pilco import kernels
+from pegasus_jax.pilco.ssgp import log_evidence, ssgp
 from probes import experience
 
 SHAPES = dict(states=3, controls=2, angles=(2,))
@@ -40,7 +40,7 @@ def features_by_hand(params, e, inputs):
 
 def test_evidence_and_posterior_are_those_of_the_bayesian_linear_model(x64):
     data, model, params = experience(), ssgp(**SHAPES, points=12), parameters(12)
-    rows, h = model.prepare(data), kernel.hyper(params)
+    rows, h = model.prepare(data), kernels.hyper(params)
     inputs, y, _, _ = rows_by_hand(data)
     belief = jax.jit(model.condition)(params, data)
     noise = np.exp(params["log_noise"])
@@ -62,7 +62,7 @@ def test_evidence_and_posterior_are_those_of_the_bayesian_linear_model(x64):
         np.testing.assert_allclose(belief.cov[e], scale**2 * cov, rtol=1e-7, atol=1e-11)
     high = np.sum(np.asarray(params["points"]) ** 2) / 12
     loss = jax.jit(model.loss)(params, None, None, rows)
-    np.testing.assert_allclose(loss * 30, kernel.penalty(h) + high - total, rtol=1e-10)
+    np.testing.assert_allclose(loss * 30, kernels.penalty(h) + high - total, rtol=1e-10)
 
 
 def test_draws_are_functions_of_the_posterior():
@@ -103,7 +103,7 @@ def test_with_many_frequencies_it_is_the_gaussian_process(x64):
     at = jnp.asarray(at + 0.3 * np.random.default_rng(1).normal(size=at.shape))
     nothing = jnp.zeros((6, 6))
     expected = jax.jit(jax.vmap(process.moments, (None, 0, None)))(belief, at, nothing)
-    evidence = jax.jit(exact.log_evidence)(kernel.hyper(params), process.prepare(data))
+    evidence = jax.jit(exact.log_evidence)(kernels.hyper(params), process.prepare(data))
 
     def errors(points):
         model = ssgp(**SHAPES, points=points)
@@ -112,7 +112,7 @@ def test_with_many_frequencies_it_is_the_gaussian_process(x64):
         def one(key):
             mine = params | {"points": jax.random.normal(key, (3, points, 6))}
             image = jax.vmap(model.moments, (None, 0, None))(model.condition(mine, data), at, nothing)
-            h, rows = kernel.hyper(mine), model.prepare(data)
+            h, rows = kernels.hyper(mine), model.prepare(data)
             mine_evidence = jax.vmap(log_evidence, (0, 0, 0, 0, None))(
                 mine["points"] / h.lengthscale[:, None], h.signal, h.noise, rows.y, rows
             )

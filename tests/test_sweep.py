@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax import record, settings
 from pegasus_jax.checks import SettingError
-from pegasus_jax.sweep import check, handle, jobs_of, values
+from pegasus_jax.cli.sweep import check, handle, jobs_of, values
+from pegasus_jax.runs import config_io, store
 from test_train import TINY
 
 PROGRAM = [sys.executable, "-c", "from pegasus_jax.sweep import sweep; sweep()"]
@@ -52,7 +52,7 @@ def test_what_is_joined_by_commas_is_split_there(found: list[str]) -> None:
 def test_every_combination_has_its_own_run() -> None:
     words = {"task": "cartpole", "search.clip": "1,10", "policy.hidden": "[5,5],[7]", "seed": "0-1"}
     jobs = jobs_of(words, Path("out"))
-    told = [settings.split(job.words, ("out",)) for job in jobs]
+    told = [config_io.split(job.words, ("out",)) for job in jobs]
     assert [options["out"] for options, _ in told] == [str(job.run) for job in jobs]
     assert len({job.run for job in jobs}) == 8
     combinations = itertools.product(("1", "10"), ("[5,5]", "[7]"), ("0", "1"))
@@ -66,7 +66,7 @@ def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
     for job in jobs:
         job.run.mkdir()
         (job.run / "config.yaml").touch()
-    assert record.seeds_of(tmp_path) == dict(zip((3, 4, 5), (job.run for job in jobs), strict=True))
+    assert store.seeds_of(tmp_path) == dict(zip((3, 4, 5), (job.run for job in jobs), strict=True))
     with pytest.raises(SettingError, match="holds a run already"):
         check(jobs[0])
 
@@ -119,5 +119,5 @@ def test_a_sweep_on_this_machine_leaves_ordinary_runs(tmp_path: Path) -> None:
     assert done.stdout.count("done: ") == 2
     for seed in (1, 2):
         run = tmp_path / "sweep" / f"seed{seed}"
-        assert [row["trial"] for row in record.trials(run)] == [1]
-        assert settings.load(run / "config.yaml").seed == seed
+        assert [row["trial"] for row in store.trials(run)] == [1]
+        assert config_io.load(run / "config.yaml").seed == seed

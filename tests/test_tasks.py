@@ -12,10 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax import record, settings, tasks
-from pegasus_jax.build import build
+from pegasus_jax import tasks
+from pegasus_jax.builder import build
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
+from pegasus_jax.runs import config_io, store
 
 # (task, legs, states, controls, horizon, control period [s])
 SHAPES = [
@@ -31,7 +32,7 @@ TINY += ["explore.trials=0", "search.refine=0", "search.anew=false"]
 
 
 def parse(*words: str) -> Config:
-    return settings.parse(settings.split(words)[1])
+    return config_io.parse(config_io.split(words)[1])
 
 
 def test_every_task_is_listed_here() -> None:
@@ -76,8 +77,8 @@ def test_tasks_bring_their_defaults() -> None:
 
 def test_the_resolved_config_survives_its_file(tmp_path: Path) -> None:
     config = parse("task=swimmer_corkscrew", "legs=6", "search.particles=20")
-    settings.save(config, tmp_path / "config.yaml")
-    assert settings.load(tmp_path / "config.yaml") == config
+    config_io.save(config, tmp_path / "config.yaml")
+    assert config_io.load(tmp_path / "config.yaml") == config
 
 
 def test_an_unknown_task_is_named() -> None:
@@ -95,11 +96,11 @@ def test_a_tiny_trial_through_the_command_line(words: list[str], tmp_path: Path)
         [*program, *words, *TINY, f"out={run}"], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    (row,) = record.trials(run)
+    (row,) = store.trials(run)
     assert not row["random"]
     assert all(np.isfinite(value) for value in row.values() if isinstance(value, float))
     task = tasks.make(words[0].removeprefix("task="))
-    ran = record.load_episode(run, 1)
+    ran = store.load_episode(run, 1)
     assert ran is not None
     u = ran.trajectory.u
     assert np.all((u >= task.control_low - 1e-5) & (u <= task.control_high + 1e-5))

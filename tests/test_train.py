@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pegasus_jax import checkpoint, record, settings
-from pegasus_jax.restore import restored
+from pegasus_jax.runs import checkpoint, config_io, store
+from pegasus_jax.runs.restore import restored
 
 # A run of seconds: the model that compiles soonest, the smallest networks and searches that go through every part.
 TINY = ["task=cartpole", "model=log_normal", "trials=3", "model.hidden=[16]", "policy.hidden=[8]"]
@@ -48,7 +48,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def timeless(run: Path) -> list[dict[str, object]]:
     """The rows of a run without what the clock says."""
-    return [{name: value for name, value in row.items() if name != "seconds"} for row in record.trials(run)]
+    return [{name: value for name, value in row.items() if name != "seconds"} for row in store.trials(run)]
 
 
 def copy_until(whole: Path, run: Path, trial: int) -> Path:
@@ -64,7 +64,7 @@ def copy_until(whole: Path, run: Path, trial: int) -> Path:
 
 
 def test_a_run_leaves_everything(whole: Path) -> None:
-    rows = record.trials(whole)
+    rows = store.trials(whole)
     assert [row["trial"] for row in rows] == [1, 2, 3]
     assert [row["plant_seconds"] for row in rows] == [2.5, 5.0, 7.5]
     assert [row["random"] for row in rows] == [True, False, False]
@@ -88,7 +88,7 @@ def test_nothing_is_learned_between_random_episodes(tmp_path: Path) -> None:
     run = tmp_path / "run"
     done = call("train", *TINY, "explore.trials=2", f"out={run}", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    rows = record.trials(run)
+    rows = store.trials(run)
     assert [row["fit_loss"] is None for row in rows] == [True, False, False]
     assert [row["objective_last"] is None for row in rows] == [True, False, False]
     assert [row["calibration"] is None for row in rows] == [True, True, False]
@@ -138,11 +138,11 @@ def test_killed_and_resumed_is_bit_equal(whole: Path, tmp_path: Path, moment: st
 def test_an_episode_on_disk_takes_the_place_of_the_plant(whole: Path, tmp_path: Path) -> None:
     """After a crash the episode that was run is used, though the plant could not repeat it."""
     run = copy_until(whole, tmp_path / "run", 1)
-    other = record.load_episode(whole, 3)
+    other = store.load_episode(whole, 3)
     assert other is not None
-    record.save_episode(run, 2, other.trajectory, record.task_of(run), policy=1, ended="horizon")
+    store.save_episode(run, 2, other.trajectory, store.task_of(run), policy=1, ended="horizon")
     assert call("train", f"resume={run}", cwd=tmp_path).returncode == 0
-    used = record.load_episode(run, 2)
+    used = store.load_episode(run, 2)
     assert used is not None
     np.testing.assert_array_equal(used.trajectory.x, other.trajectory.x)
     assert fingerprint(run) != fingerprint(whole)
@@ -170,8 +170,8 @@ def test_all_checkpoints_damaged_starts_from_the_episodes(whole: Path, tmp_path:
 def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_path: Path) -> None:
     """As those of an older version may be, whose model was another. Resuming begins with the data."""
     run = copy_until(whole, tmp_path / "run", 2)
-    config = settings.load(run / "config.yaml")
-    settings.save(settings.override(config, {"model.hidden": [17]}), run / "config.yaml")
+    config = config_io.load(run / "config.yaml")
+    config_io.save(config_io.override(config, {"model.hidden": [17]}), run / "config.yaml")
     refused = call("evaluate", str(run), cwd=tmp_path)
     assert refused.returncode == 2
     assert "no checkpoint that this version can use" in refused.stderr
@@ -183,7 +183,7 @@ def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_pa
     assert done.returncode == 0, done.stderr
     assert "of another version, or of other settings than config.yaml" in done.stderr
     for trial in (1, 2):
-        one, other = record.load_episode(run, trial), record.load_episode(whole, trial)
+        one, other = store.load_episode(run, trial), store.load_episode(whole, trial)
         assert one is not None
         assert other is not None
         np.testing.assert_array_equal(one.trajectory.x, other.trajectory.x)
@@ -223,8 +223,8 @@ def test_a_file_that_the_disk_refuses_ends_the_command_in_one_line(whole: Path, 
 
 
 def test_the_policy_of_a_trial_is_evaluated(whole: Path, tmp_path: Path) -> None:
-    rows = record.trials(whole)
-    best = record.best_trial(rows)
+    rows = store.trials(whole)
+    best = store.best_trial(rows)
     for asked, trial in (("trial=1", 1), ("trial=best", best), ("trial=last", 3)):
         done = call("evaluate", whole, asked, "episodes=1", "json=true", cwd=tmp_path)
         assert json.loads(done.stdout)["trial"] == trial, done.stderr
@@ -241,7 +241,7 @@ def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:
     run = copy_until(whole, tmp_path / "run", 9)
     done = call("train", f"resume={run}", "trials=4", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
-    assert [row["trial"] for row in record.trials(run)] == [1, 2, 3, 4]
+    assert [row["trial"] for row in store.trials(run)] == [1, 2, 3, 4]
     fewer = call("train", f"resume={run}", "trials=2", cwd=tmp_path)
     assert fewer.returncode == 2
     assert "at least 4" in fewer.stderr
@@ -253,20 +253,20 @@ def test_a_run_goes_on_with_another_search(whole: Path, tmp_path: Path) -> None:
     done = call("train", f"resume={run}", "trials=4", "search.steps=3", "search.best=true", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "not usable" not in done.stderr
-    rows = record.trials(run)
-    assert rows[:3] == record.trials(whole)
+    rows = store.trials(run)
+    assert rows[:3] == store.trials(whole)
     assert rows[3]["trial"] == 4
     assert np.isfinite(rows[3]["objective_last"])
     about = json.loads((run / "run.json").read_text())
     assert [command["done"] for command in about["commands"]] == [0, 3]
     assert "search.best=true" in about["commands"][1]["command"]
-    now = settings.leaves(settings.load(run / "config.yaml"))
+    now = config_io.leaves(config_io.load(run / "config.yaml"))
     assert (now["search.steps"], now["search.best"]) == (3, True)
 
 
 def test_two_processes_cannot_write_to_one_run(whole: Path, tmp_path: Path) -> None:
     run = copy_until(whole, tmp_path / "run", 9)
-    with record.lock(run):
+    with store.lock(run):
         done = call("train", f"resume={run}", cwd=tmp_path)
     assert done.returncode == 2
     assert "another process" in done.stderr
@@ -275,7 +275,7 @@ def test_two_processes_cannot_write_to_one_run(whole: Path, tmp_path: Path) -> N
 
 def test_eval_and_plot_work_while_a_run_goes_on(whole: Path, tmp_path: Path) -> None:
     run = copy_until(whole, tmp_path / "run", 2)
-    with record.lock(run):
+    with store.lock(run):
         evaluated = call("evaluate", run, "episodes=2", "json=true", cwd=tmp_path)
         plotted = call("plot", run, cwd=tmp_path)
     told = json.loads(evaluated.stdout)

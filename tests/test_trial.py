@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.build import compose
+from pegasus_jax.builder import compose
 from pegasus_jax.config import Period
-from pegasus_jax.trial import COLLECT, EVALUATE, FIT, IMAGINE, RESTART, SEARCH, TrialInfo, run, trial_key
+from pegasus_jax.experiment import COLLECT, EVALUATE, FIT, IMAGINE, RESTART, SEARCH, TrialInfo, run, trial_key
 from pegasus_jax.types import Policy, Prediction
 from probes import Counter, Linear, cart, dial, known, noisy_linear_policy, regression, same, tiny, unchecked
 

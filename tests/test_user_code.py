@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pegasus_jax import user_code
 from pegasus_jax.checks import SettingError
+from pegasus_jax.tasks import user_code
 
 
 @pytest.fixture

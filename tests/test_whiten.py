@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax import whiten as module
+from pegasus_jax.math import normalize as module
 
 whitener = jax.jit(module.whitener, static_argnames="full")
 whiten, unwhiten = jax.jit(module.whiten), jax.jit(module.unwhiten)

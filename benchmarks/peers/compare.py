@@ -28,8 +28,8 @@ from torch import Tensor
 from benchmarks.peers import of_mc_pilco, of_prob_mbrl, plain_torch
 from benchmarks.timing import compiled, in_turn, own_products, summary
 from benchmarks.workloads import SIZES, Workload, goal, workload
-from pegasus_jax import settings
-from pegasus_jax.machine import about
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.machine import about
 
 RESULTS = Path(__file__).parents[1] / "results"
 STEPS, FIT_STEPS = 10, 100  # in one timed run
@@ -141,7 +141,7 @@ def beside_mc_pilco(package: Any, work: Workload, repeats: int) -> dict[str, Any
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, dotted = settings.split(words, ("sizes", "repeats", "compile", "threads", "prob_mbrl", "mc_pilco", "out"))
+    options, dotted = config_io.split(words, ("sizes", "repeats", "compile", "threads", "prob_mbrl", "mc_pilco", "out"))
     prob_mbrl = of_prob_mbrl.load(Path(options["prob_mbrl"])) if "prob_mbrl" in options else None
     mc_pilco = of_mc_pilco.load(Path(options["mc_pilco"])) if "mc_pilco" in options else None
     torch.set_num_threads(int(options.get("threads", "1")))

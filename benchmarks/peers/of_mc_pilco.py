@@ -38,10 +38,10 @@ from torch import Tensor
 
 from benchmarks.suite import widened
 from benchmarks.workloads import EPISODES, Workload, goal, workload
-from pegasus_jax import kernel
-from pegasus_jax.dynamics.gp import Belief
-from pegasus_jax.kernel import inputs_of
-from pegasus_jax.policy.rbf import regress
+from pegasus_jax.pilco import kernels
+from pegasus_jax.pilco.gp import Belief
+from pegasus_jax.pilco.kernels import inputs_of
+from pegasus_jax.pilco.rbf import regress
 from pegasus_jax.types import Array, Params, Task
 
 # What makes a size comparable: a model and a policy that both have, each particle's own cost, room for the rows alone.
@@ -76,7 +76,7 @@ def comparable(words: dict[str, str], horizon: int | None = None) -> Workload:
     gradient right.
     """
     work = workload(words, horizon)
-    params = kernel.start(len(work.task.state_names), work.belief.x.shape[1])
+    params = kernels.start(len(work.task.state_names), work.belief.x.shape[1])
     params |= {"log_lengthscale": params["log_lengthscale"] + np.log(4)}
     return of_the_mean(work._replace(state=work.state._replace(model=work.state.model._replace(params=params))))
 

@@ -30,10 +30,11 @@ from torch import Tensor
 
 from benchmarks.peers.plain_torch import Layers
 from benchmarks.workloads import Workload, goal
-from pegasus_jax import cost, moments
-from pegasus_jax.angles import encode
-from pegasus_jax.rollout import NoiseUse
-from pegasus_jax.search import objective
+from pegasus_jax.imagine import costs as cost
+from pegasus_jax.imagine import matching
+from pegasus_jax.imagine.rollout import NoiseUse
+from pegasus_jax.learn.search import objective
+from pegasus_jax.math.angles import encode
 
 Tensors = Callable[[Any], Tensor]
 
@@ -136,7 +137,7 @@ def disagreement(package: Any, work: Workload, layers_of: Callable[[Any], Layers
     z = (z - z.mean(0)) / z.std(0, ddof=1)
     rolled = np.stack([np.roll(z, -t, axis=0) for t in range(task.horizon)])
     given = work.scenarios._replace(match=jnp.asarray(rolled))
-    match = moments.match if config.search.match else moments.keep
+    match = matching.match if config.search.match else matching.keep
     value = partial(
         objective,
         dynamics=work.experiment.dynamics,

@@ -3,22 +3,34 @@
 Everything here is a plain function or a plain value, to be jitted, vmapped and differentiated in your own code.
 """
 
-import sys
 from importlib import import_module
-from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pegasus_jax import tasks
-    from pegasus_jax.build import build, compose
+    from pegasus_jax.builder import build, compose
     from pegasus_jax.config import Config
-    from pegasus_jax.deploy import controller
-    from pegasus_jax.fit import fit
-    from pegasus_jax.rollout import rollout
-    from pegasus_jax.scenarios import draw
-    from pegasus_jax.search import objective, optimise
-    from pegasus_jax.trial import run, trial
+    from pegasus_jax.experiment import run, trial
+    from pegasus_jax.imagine.rollout import rollout
+    from pegasus_jax.imagine.scenarios import draw
+    from pegasus_jax.learn.fit import fit
+    from pegasus_jax.learn.search import objective, optimise
+    from pegasus_jax.runs.controller import controller
 
+_MODULES = {
+    "Config": "config",
+    "build": "builder",
+    "compose": "builder",
+    "controller": "runs.controller",
+    "draw": "imagine.scenarios",
+    "fit": "learn.fit",
+    "objective": "learn.search",
+    "optimise": "learn.search",
+    "rollout": "imagine.rollout",
+    "run": "experiment",
+    "tasks": "tasks",
+    "trial": "experiment",
+}
 __all__ = [
     "Config",
     "build",
@@ -35,36 +47,13 @@ __all__ = [
 ]
 
 
-class _From:
-    """A name that is imported from its module when somebody asks for it, so that a command speaks before JAX is there.
-
-    It is a descriptor because some names are also those of their modules, which Python would put in their place.
-    """
-
-    def __init__(self, module: str, name: str) -> None:
-        self.module, self.name = f"{__name__}.{module}", name
-
-    def __get__(self, package: ModuleType, kind: type) -> Any:
-        module = import_module(self.module)
-        return getattr(module, self.name) if self.name else module
-
-    def __set__(self, package: ModuleType, value: Any) -> None:
-        """Python has imported a module of this name."""
+def __getattr__(name: str) -> Any:
+    """A name is imported when somebody asks for it, so that a command speaks before JAX is there."""
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__} has no attribute {name}")
+    module = import_module(f"{__name__}.{_MODULES[name]}")
+    return module if name == "tasks" else getattr(module, name)
 
 
-class _Package(ModuleType):
-    Config = _From("config", "Config")
-    build = _From("build", "build")
-    compose = _From("build", "compose")
-    controller = _From("deploy", "controller")
-    draw = _From("scenarios", "draw")
-    fit = _From("fit", "fit")
-    objective = _From("search", "objective")
-    optimise = _From("search", "optimise")
-    rollout = _From("rollout", "rollout")
-    run = _From("trial", "run")
-    tasks = _From("tasks", "")
-    trial = _From("trial", "trial")
-
-
-sys.modules[__name__].__class__ = _Package
+def __dir__() -> list[str]:
+    return __all__

@@ -47,7 +47,7 @@ def train(*words: str, begin: Sequence[str] = BASE, refused: bool = False) -> Co
 def settings_words() -> list[Command]:
     """Every setting of the default config with every value."""
     from pegasus_jax.config import Config
-    from pegasus_jax.settings import leaves
+    from pegasus_jax.runs.config_io import leaves
 
     return [train(f"{name}={value}") for name in leaves(Config()) for value in VALUES]
 

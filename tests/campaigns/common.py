@@ -71,10 +71,6 @@ def load() -> None:
     import tensorboardX  # noqa: F401
 
     import pegasus_envs.gym  # noqa: F401
-    import pegasus_jax.cli
-    import pegasus_jax.report.plot
-    import pegasus_jax.sweep
-    import pegasus_jax.train  # noqa: F401
 
     threads = len(os.listdir("/proc/self/task"))
     assert threads == 1, f"{threads} threads: a forked child would wait for those it does not have"

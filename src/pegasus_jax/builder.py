@@ -1,0 +1,414 @@
+"""Config -> Experiment. The only place that matches on the kind of a setting."""
+
+from collections.abc import Callable
+from functools import lru_cache, partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from jax.sharding import Mesh
+
+from pegasus_jax import config as settings
+from pegasus_jax import episode, tasks
+from pegasus_jax.checks import SettingError
+from pegasus_jax.experiment import experiment
+from pegasus_jax.imagine import costs as cost
+from pegasus_jax.imagine import matching, scenarios
+from pegasus_jax.imagine.costs import of_particles
+from pegasus_jax.imagine.rollout import NoiseUse, rollout
+from pegasus_jax.learn.fit import falling, minibatches
+from pegasus_jax.learn.multistart import best_of
+from pegasus_jax.learn.schedule import Course, either, narrowing, pace, reheated
+from pegasus_jax.learn.search import keeping_best, objective, particles, remembering
+from pegasus_jax.math import angles, gaussian
+from pegasus_jax.models import dropout
+from pegasus_jax.models.bnn import bnn
+from pegasus_jax.models.ensemble import ensemble
+from pegasus_jax.models.lagrangian import lagrangian
+from pegasus_jax.models.noisy import HEADS
+from pegasus_jax.pilco import search as pilco
+from pegasus_jax.pilco.gp import gp
+from pegasus_jax.pilco.lbfgs import full_data
+from pegasus_jax.pilco.rbf import rbf
+from pegasus_jax.pilco.ssgp import ssgp
+from pegasus_jax.policies.linear import linear
+from pegasus_jax.policies.mlp import mlp
+from pegasus_jax.policies.scaled import inherited
+from pegasus_jax.policies.squash import SQUASHES, to_limits
+from pegasus_jax.sharding import Spread, over_particles, together
+from pegasus_jax.types import (
+    Array,
+    Dropout,
+    Dynamics,
+    Experiment,
+    Fitter,
+    Key,
+    Params,
+    Period,
+    Policy,
+    Rollout,
+    Scenarios,
+    Searcher,
+    Task,
+)
+
+AGGREGATES = {"mean": cost.mean, "total": cost.total}
+NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
+    "log_normal": lambda config: dropout.log_normal(config.low, config.high),
+    "binary": lambda config: dropout.binary(config.rate),
+    "concrete": lambda config: dropout.concrete(config.rate),
+    "gaussian": lambda _: dropout.gaussian(),
+    "sparse": lambda _: dropout.sparse(),
+    "none": lambda _: dropout.none(),
+}
+EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
+
+
+@lru_cache(maxsize=64)
+def build(config: settings.Config, mesh: Mesh | None = None) -> Experiment:
+    """The experiment of a config. Cached: the same config gives the same functions, which compile once."""
+    return compose(config, tasks.of_config(config), mesh=mesh)
+
+
+def compose(
+    config: settings.Config,
+    task: Task,
+    dynamics: Dynamics | None = None,
+    policy: Policy | None = None,
+    mesh: Mesh | None = None,
+) -> Experiment:
+    """The experiment of a config on any task; a model or policy of your own takes the configured one's place.
+
+    With a `mesh` (mesh.py) the particles of a search are spread over its devices.
+    """
+    dynamics = dynamics or dynamics_of(config.model, task)
+    policy = policy or policy_of(config.policy, task)
+    searcher, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
+    low, high = limits(task)
+    explore = config.explore
+    return experiment(
+        task=task,
+        dynamics=dynamics,
+        policy=policy,
+        fit=fit_of(config.fit, dynamics),
+        fit_steps=config.fit.steps,
+        search=searcher,
+        search_steps=config.search.steps,
+        search_reset=config.search.reset,
+        search_restart=config.search.restart,
+        search_goes_on=config.search.anneal > 1,
+        imagine=imagine,
+        explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
+        explore_trials=explore.trials,
+        compare=config.successor == "better",
+        mean_execution=config.policy.execution == "mean",
+        capacity=config.trials * task.horizon,
+    )
+
+
+def set_precision(config: settings.Config) -> None:
+    """Make the configured precision JAX's own, for everything in this process from now on.
+
+    That of products too, unless JAX was told: a GPU's usual 10 bits are too few for gradients of a whole rollout.
+    """
+    jax.config.update("jax_enable_x64", config.precision == "double")
+    if jax.default_backend() == "gpu" and jax.config.jax_default_matmul_precision is None:  # pyright: ignore[reportAttributeAccessIssue]
+        jax.config.update("jax_default_matmul_precision", "float32")
+
+
+def limits(task: Task) -> tuple[Array, Array]:
+    """The lowest and the highest control [U]."""
+    return jnp.asarray(task.control_low, float), jnp.asarray(task.control_high, float)
+
+
+def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
+    """The configured way of fitting a model."""
+    if isinstance(config, settings.LBFGS):
+        return full_data(dynamics, starts=config.starts)
+    rate = falling(config.learning_rate, config.decay, config.steps)
+    return minibatches(dynamics, optax.adam(rate), batch=config.batch, reset=config.reset)
+
+
+Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]  # (key, policy parameters, belief) -> cost [H, K] too
+
+
+def search_of(
+    search: settings.Search | settings.Analytic,
+    task: Task,
+    dynamics: Dynamics,
+    policy: Policy,
+    spread: Spread = together,
+) -> tuple[Searcher, Imagine]:
+    """The configured way of improving a policy, and fresh imagined rollouts of the same kind."""
+    aggregate = AGGREGATES[search.aggregate]
+    known = tasks.known_sensors(task) if search.sensors == "known" else None
+    noise = NoiseUse(search.policy_noise, search.state_noise, search.cost_noise, known)
+    if isinstance(search, settings.Analytic):
+        return analytic_search_of(search, task, dynamics, policy, discounted(search, aggregate), noise)
+    if (search.match or search.balanced) and search.particles <= len(task.state_names):
+        states, what = len(task.state_names), "moment matching" if search.match else "balanced draws"
+        raise SettingError(
+            f"search.particles={search.particles} is too few: {what} of {states} dimensions needs at least {states + 1}"
+        )
+    if search.risk < 1:
+        aggregate = cost.worst(search.risk, aggregate)
+    blocks = blocks_of(search.particles, task, dynamics, policy, balanced=search.balanced, spread=spread)
+    pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
+    # A particle's cost is 1 / K of the objective.
+    limit = None if search.limit is None else search.limit / search.particles
+    ends: dict[str, Any] = dict(aggregate=discounted(search, aggregate), truncate=search.truncate)
+    match = matching.match if search.match else matching.keep
+    costs = costs_of(search, task)
+    # The last part of a search is for refining: no matching, each particle's own cost, at its own width.
+    refine = round((1 - search.refine) * search.steps) if search.refine else None
+    steps = search.anneal * search.steps
+    narrow = (steps if refine is None else refine) / 2 if search.widen > 1 else 0
+    width = narrowing(search.widen, narrow) if narrow else None
+    step = pace(steps, search.decay, refine)
+    if step is not None and search.reheat:
+        step = reheated(step, steps, search.steps, search.reheat, search.decay)
+
+    def value(params: Params, belief: Params, given: Scenarios, iteration: Array) -> Array:
+        refining = None if refine is None else iteration >= refine
+        cost = costs(refining, width and width(iteration))
+        onwards = either(refining, matching.keep, match)
+        longest = limit * jnp.where(iteration < steps, 1, search.loosen) if limit and search.reheat else limit
+        return objective(params, belief, given, **pieces, **ends, limit=longest, match=onwards, cost=cost)
+
+    clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
+    optimizer = optax.chain(clip, optax.adam(search.learning_rate))
+    searcher = particles(
+        value,
+        remembering(optimizer) if search.best else optimizer,
+        blocks=blocks,
+        period=Period(**vars(search.period)),
+        course=Course(
+            stage=jnp.asarray,
+            pace=step,
+            settled=narrow if refine is None else refine,
+            turns=() if refine is None else (refine, search.steps),
+            anew=search.anew,
+        ),
+    )
+    if search.best:
+        searcher = keeping_best(searcher, search.steps)
+    if search.starts > 1:
+        lasting = search.anneal > 1  # one course for all searches: who began late would be behind
+        window = 1 if search.refine else max(1, search.steps // 20)  # what refines may end with another than its last
+        fresh = lambda key, given: inherited(policy.init(key), given)  # noqa: E731
+        searcher = best_of(searcher, fresh, starts=search.starts, window=window, lasting=lasting)
+    # A refined policy is good for particles, not for their Gaussian.
+    seen_last = match if refine is None else matching.keep
+    return searcher, partial(imagined, **pieces, match=seen_last, blocks=blocks, task=task)
+
+
+def analytic_search_of(
+    search: settings.Analytic,
+    task: Task,
+    dynamics: Dynamics,
+    policy: Policy,
+    aggregate: cost.Aggregate,
+    noise: NoiseUse,
+) -> tuple[Searcher, Imagine]:
+    """PILCO's search. Raises SettingError where a piece has no moments."""
+    if task.stop is not None:
+        raise SettingError("algorithm=pilco propagates a Gaussian, which cannot stop; leave out stop=")
+    if dynamics.moments is None:
+        raise SettingError("algorithm=pilco needs a model with analytic moments: model=ssgp, model=gp")
+    if policy.moments is None:
+        raise SettingError(
+            "algorithm=pilco needs a policy with analytic moments, saturated by sines: policy=rbf, policy=linear"
+        )
+    mean, std = jnp.asarray(task.start_mean, float), jnp.asarray(task.start_std, float)
+    low, high = limits(task)
+    pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy)
+
+    def noise_std(key: Key, belief: Params) -> Array:
+        middle = (low + high) / 2
+        return dynamics.apply(belief, dynamics.sample(key, belief), mean, middle).std
+
+    def value(params: Params, belief: Params, std: Array) -> Array:
+        return pilco.objective(
+            params,
+            belief,
+            begin,
+            std,
+            **pieces,
+            horizon=task.horizon,
+            angles=task.angles,
+            expected_cost=expected,
+            aggregate=aggregate,
+            noise=noise,
+        )
+
+    begin, expected = (mean, jnp.diag(std**2)), expected_cost_of(task)
+    blocks = blocks_of(search.particles, task, dynamics, policy)
+    imagine = partial(imagined, **pieces, blocks=blocks, task=task, match=matching.keep, noise=noise)
+    return pilco.analytic(value, noise_std), imagine
+
+
+def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Array | None], Callable[[Array], Array]]:
+    """(whether this refines, a factor of the cost's width; None: never) -> costs [H, K] or [H, 1] of states [H, K, D].
+
+    Raises SettingError where the task's cost has no width.
+    """
+    if search.widen > 1 and task.widened is None:
+        raise SettingError(
+            f"search.widen={search.widen:g} needs a cost with a width, which that of task={task.name} lacks;"
+            " the nearest is 1"
+        )
+
+    def costs(refining: Array | None, width: Array | None) -> Callable[[Array], Array]:
+        of_state, expected = task.cost, expected_cost_of(task)
+        if width is not None and task.widened is not None:
+            of_state, expected = task.widened(width)
+        each = cost.of_particles(of_state)
+        if search.cost != "matched":
+            return until_stop(task, each)
+        return until_stop(
+            task, either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), cost.of_matched(expected))
+        )
+
+    return costs
+
+
+def until_stop(task: Task, costs: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """The costs of particles that end where the task's episodes do."""
+    if task.stop is None:
+        return costs
+    return lambda x: cost.until_stop(costs(x), x, task.stop, task.stop_cost)  # type: ignore[arg-type]
+
+
+def expected_cost_of(task: Task) -> cost.Expected:
+    """The task's expected cost of a Gaussian state: in closed form where that is known, else by nodes."""
+    return task.expected_cost or cost.expected_by_nodes(task.cost, len(task.state_names))
+
+
+def discounted(search: settings.Search | settings.Analytic, aggregate: cost.Aggregate) -> cost.Aggregate:
+    """The aggregate, discounted where the search says so."""
+    return cost.discounted(search.discount, aggregate) if search.discount < 1 else aggregate
+
+
+def blocks_of(
+    particles: int,
+    task: Task,
+    dynamics: Dynamics,
+    policy: Policy,
+    balanced: bool = False,
+    spread: Spread = together,
+) -> scenarios.Blocks:
+    """How the scenarios of a task's imagined rollouts are drawn."""
+    return scenarios.blocks(
+        dynamics=dynamics,
+        policy=policy,
+        start=partial(start, task=task),
+        particles=particles,
+        horizon=task.horizon,
+        balanced=balanced,
+        spread=spread,
+    )
+
+
+def imagined(
+    key: Key,
+    params: Params,
+    belief: Params,
+    *,
+    blocks: scenarios.Blocks,
+    task: Task,
+    **pieces: Any,
+) -> tuple[Rollout, Array]:
+    """Rollouts under fresh scenarios and the cost of every particle [H, K]."""
+    rolled = rollout(params, belief, scenarios.draw(key, 0, belief, blocks=blocks, period=Period()), **pieces)
+    return rolled, until_stop(task, of_particles(task.cost))(rolled.seen)
+
+
+def start(key: Key, *, task: Task) -> Array:
+    """A first state [D] of the task."""
+    mean, std = jnp.asarray(task.start_mean, float), jnp.asarray(task.start_std, float)
+    return mean + std * jax.random.normal(key, mean.shape)
+
+
+def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
+    """The configured model of a task's dynamics. Raises SettingError where the task does not suit it."""
+    shape: dict[str, Any] = dict(states=len(task.state_names), controls=len(task.control_names), angles=task.angles)
+    match config:
+        case settings.GP():
+            return gp(**shape, features=config.features)
+        case settings.SSGP():
+            return ssgp(**shape, points=config.points)
+        case settings.Lagrangian():
+            rates = tasks.rates_of(task)
+            member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
+        case settings.BNN():
+            member = bnn(
+                **shape,
+                **network_of(config),
+                input_dropout=dropout_of(config) if config.input_noise else None,
+                heteroscedastic=config.heteroscedastic,
+                full_whitening=config.whitening == "full",
+            )
+    return ensemble(member, config.members) if config.members > 1 else member
+
+
+def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
+    """What describes the network of a model."""
+    return dict(
+        hidden=config.hidden,
+        dropout=dropout_of(config),
+        head=HEADS[config.head],
+        kl_weight=config.kl_weight,
+        weight_decay=config.weight_decay,
+        activation=config.activation,
+        initialiser=config.initialiser,
+    )
+
+
+def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
+    """The configured noise on a model's units. Raises SettingError for parameters it cannot have."""
+    try:
+        return NOISES[config.dropout](config)
+    except ValueError as error:
+        raise SettingError(f"model.dropout={config.dropout}: {error}") from error
+
+
+def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task) -> Policy:
+    """The configured controller of a task."""
+    low, high = limits(task)
+    encode = partial(angles.encode, angles=task.angles)
+    features, controls = len(task.state_names) + len(task.angles), len(task.control_names)
+    saturate = to_limits(SQUASHES[config.squash], low, high)
+    # Of the saturations, only the sine has moments in closed form.
+    saturate_moments = partial(gaussian.squash, low=low, high=high) if config.squash == "sine" else None
+    match config:
+        case settings.RBF():
+            return rbf(
+                encode=encode,
+                start=partial(start, task=task),
+                waves=2 * len(task.angles),
+                controls=controls,
+                units=config.units,
+                saturate=saturate,
+                saturate_moments=saturate_moments,
+            )
+        case settings.Linear():
+            return linear(
+                encode=encode,
+                features=features,
+                controls=controls,
+                saturate=saturate,
+                saturate_moments=saturate_moments,
+            )
+        case settings.MLP():
+            return mlp(
+                encode=encode,
+                features=features,
+                controls=controls,
+                hidden=config.hidden,
+                dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
+                saturate=saturate,
+                initialiser=config.initialiser,
+                input_scale=tasks.input_scale(task, config.input_units),
+                output_scale=config.output_scale,
+            )

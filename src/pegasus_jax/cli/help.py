@@ -1,0 +1,139 @@
+"""What the commands say of themselves."""
+
+from collections.abc import Sequence
+
+from pegasus_jax.cli.train import OPTIONS
+
+TRAIN = """\
+pegasus-train task=NAME [setting=value ...]     learn a controller
+pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that was killed; or with other evaluation=,
+                                                fit.* or search.* settings
+
+  task=cartpole         what to learn: {tasks}
+  model=log_normal      dynamics model: {models}
+                        (default: the one that learns the task best, of cartpole and double_cartpole lagrangian)
+  policy=mlp            controller: {policies}
+  algorithm=pegasus     how to search: {algorithms}
+  out=runs/...          the run's folder (default: runs/TASK-seedN)
+  final=true            run the last policy for one more episode, which is data if the run goes on
+  seeds=1               so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN
+  mesh=SEEDSxPARTICLES  the devices that share seeds and particles (default: as many GPUs, or cores of a CPU, as share
+                        the seeds evenly)
+  distributed=true      started on several hosts at once by SLURM or MPI: their devices act as one machine; without
+                        those, coordinator=HOST:PORT processes=N process=I on each. They share OUT on one file system
+
+A task and a named variant bring their own values of the settings below, which change them one by one. Shown is what
+they are with the words beside --help: pegasus-train task=gym algorithm=paper --help
+{settings}
+{others}
+PEGASUS_SETTINGS="fit.steps=5 search.steps=5" in the environment adds these words to every pegasus-train and
+pegasus-figures command, after those that are typed: of two values of a setting, the last one counts.
+
+examples
+  pegasus-train task=cartpole
+  pegasus-train task=cartpole policy.hidden=[50,50] seed=3 trials=10 out=runs/demo
+  pegasus-train task=cartpole seeds=10
+  pegasus-train task=cartpole algorithm=deep_pilco search.clip=1
+  pegasus-train task=swimmer_corkscrew legs=6
+  pegasus-train task=gym env=Pendulum-v1 cost=mymodule:cost horizon=40
+  pegasus-train task=gym env=robot:Arm-v0 cost=robot:cost start_mean=[3.14,0] evaluation=0       (a robot)
+  pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
+  pegasus-train resume=runs/demo trials=20 search.steps=2000
+
+Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN or pegasus-play RUN; or with
+tensorboard --logdir RUN/tensorboard, after pip install tensorboard.
+"""
+
+CHECK = """\
+pegasus-check task=NAME [setting=value ...]     look at a task before it is learned
+
+Takes the words of pegasus-train, which looks first itself. Opens the environment, resets it once, drives nothing and
+closes it; without start_mean= it is reset more often, as pegasus-train does. Prints spaces, limits, control period,
+start and the cost there, and what its owner should know: a cost above 1, angles that look like degrees, readings that
+never change or follow from others. What cannot be learned is one line, and the exit status 2.
+
+examples
+  pegasus-check task=gym env=robot:Arm-v0 cost=robot:cost angles=[0] start_mean=[3.14,0]
+  pegasus-check task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
+"""
+
+EVALUATE = """\
+pegasus-eval RUN [trial=last] [episodes=20] [seed=0] [json=true]     run a learned policy on its plant
+
+Uses the policy after trial=N, trial=best or the last trial, and episodes that never become data. mjcf=FILE names the
+model's file where it was moved.
+Prints mean cost per step, success rate (last five steps cost less than .2 on average) and the run's fingerprint:
+SHA-256 over data, model and policy parameters. With json=true, one JSON object.
+"""
+
+PLOT = """\
+pegasus-plot RUN     draw a run, or the runs of many seeds, finished or not
+
+Writes RUN/plots/learning.png (cost and success against plant time) and RUN/plots/trial_NNNN.png for every trial:
+states, force and cost of the imagined particles after that trial, and over them what the plant did next.
+For a folder of seeds, FOLDER/learning.png: every seed's raw curve thin, their interquartile mean thick with its 95 %
+bootstrap interval.
+"""
+
+PLAY = """\
+pegasus-play RUN [trial=last] [episodes=1] [seed=0]     film a learned policy on its plant
+
+Writes RUN/play.mp4: fresh episodes of the newest whole checkpoint of the run, finished or not, in real time,
+20 pictures a second, with cost and command drawn below as they come about. Another seed= gives other starts and
+other noise. No display is needed: OpenGL comes from EGL or OSMesa, and MUJOCO_GL=egl|osmesa|glfw chooses; without
+a graphics card a picture takes a tenth of a second or two, so a minute for the swimmer's 20 s.
+
+examples
+  pegasus-play runs/cartpole-seed0
+  pegasus-play runs/cartpole-seed0 episodes=5 seed=1
+"""
+
+FIGURES = """\
+pegasus-figures FILE [out=runs/figures] [seeds=0-9] [variants=A,B] [setting=value ...]     compare learning curves
+
+FILE is TOML and says what varies, over which seeds and how many trials. Each variant is one vmapped program of all its
+seeds and leaves OUT/NAME-VARIANT.json, written after every trial; one that is there already is not run again. Then
+draws OUT/NAME.png (every seed thin, the interquartile mean thick with its 95 % bootstrap interval) and prints what came
+out, and what that says to the file's claims.
+
+  out=runs/figures      the folder of the studies; NAME is FILE without .toml
+  seeds=0-9             instead of the file's; or seeds=0,3,7
+  variants=A,B          run only these; all that are there are drawn
+  setting=value         in every variant, instead of the file's; pegasus-train --help lists settings
+
+a file
+  title = "How wide a policy?"
+  trials = 15
+  common = "task=cartpole algorithm=pegasus"
+  [variants]
+  narrow = "policy.hidden=[50,50]"
+  wide = "policy.hidden=[200,200]"
+
+With picture = "area", the area under each learning curve, a dot a seed. The paper's own are in benchmarks/figures/.
+On two CPU cores a variant of ten seeds takes most of an hour, on one GPU a minute or two.
+"""
+
+WORDS = {"-h", "--help", "help"}
+
+
+def help_of(text: str, words: Sequence[str]) -> str:
+    """A command's help; of its settings as these words leave them. Raises SettingError for words that cannot be."""
+    if "{settings}" not in text:
+        return text
+    from pegasus_jax.defaults import NAMES
+    from pegasus_jax.runs import config_io
+    from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
+
+    named = dict(tasks=NAMES, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
+    lists = {name: ", ".join(values) for name, values in named.items()}
+    _, dotted = config_io.split([word for word in words if word not in WORDS], OPTIONS)
+    config = config_io.parse(dotted, OPTIONS)
+    others = [
+        f"\nwith {section}.kind={kind}, chosen by model=, policy= or algorithm=\n"
+        + "\n".join(config_io.help_lines(default, f"{section}."))
+        + "\n"
+        for section, kinds in KINDS.items()
+        for kind, default in kinds.items()
+        if kind != getattr(config, section).kind
+    ]
+    return text.format(settings="\n".join(config_io.help_lines(config)), others="".join(others), **lists)

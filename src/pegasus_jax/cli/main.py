@@ -1,0 +1,131 @@
+"""The commands pegasus-train, -check, -eval, -plot, -play, -figures: `key=value` words in, an exit status out."""
+
+import os
+import shlex
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from pegasus_jax import interrupt
+from pegasus_jax.checks import RunError, SettingError
+from pegasus_jax.cli import help, runs
+from pegasus_jax.cli import train as cli_train
+from pegasus_jax.runs import cache, files
+
+
+def train() -> None:
+    """Entry point of pegasus-train."""
+    main(cli_train.train, help.TRAIN)
+
+
+def check() -> None:
+    """Entry point of pegasus-check."""
+    main(cli_train.check, help.CHECK, stopped="nothing was written")
+
+
+def evaluate() -> None:
+    """Entry point of pegasus-eval."""
+    main(runs.evaluate, help.EVALUATE)
+
+
+def plot() -> None:
+    """Entry point of pegasus-plot."""
+    main(runs.plot, help.PLOT)
+
+
+def play() -> None:
+    """Entry point of pegasus-play."""
+    main(runs.play, help.PLAY)
+
+
+def figures() -> None:
+    """Entry point of pegasus-figures."""
+    main(runs.figures, help.FIGURES, stopped="finished variants are kept, the same command goes on")
+
+
+def main(
+    command: Callable[[Sequence[str]], None],
+    text: str,
+    stopped: str = "nothing was learned",
+) -> None:
+    """Run a command: 0 done, 2 a setting or a run's folder that cannot be, in one line, 130 after Ctrl-C.
+
+    Whatever ends it, a robot is let go first, and no thread that still compiles is waited for.
+    """
+    words = sys.argv[1:]
+    interrupt.before_end(_let_robots_go)
+    try:
+        interrupt.listen()
+        code = _code(command, words, text)
+    except BaseException as error:
+        interrupt.clean_up()
+        if not (interrupt.asked() or isinstance(error, KeyboardInterrupt)):
+            raise
+        print(_stopped(cli_train.begun[0]) if cli_train.begun else f"stopped; {stopped}", file=sys.stderr)
+        code = interrupt.status()
+    interrupt.clean_up()
+    interrupt.end(code)
+
+
+def _stopped(home: Path) -> str:
+    from pegasus_jax.runs.display import stopped
+
+    return stopped(home)
+
+
+def _let_robots_go() -> None:
+    """Close every environment that is open."""
+    if "pegasus_jax.tasks" in sys.modules:  # else none can be
+        from pegasus_jax.tasks import close_environments
+
+        close_environments()
+
+
+def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: str) -> int:
+    """The exit status of a command that nobody stopped."""
+    try:
+        words = [*words, *(_always() if words and command in (cli_train.train, runs.figures) else ())]
+        if not words or help.WORDS & {*words}:
+            print(help.help_of(text, words), end="")
+            return 0 if words else 2
+        _remember_compilations()
+        command(words)
+    except (SettingError, RunError) as error:
+        interrupt.clean_up()
+        print(f"pegasus: {error}", file=sys.stderr)
+        return 2
+    except OSError as error:
+        interrupt.clean_up()
+        print(f"pegasus: {files.refused(error)}{_goes_on()}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _goes_on() -> str:
+    """How to go on with what was begun."""
+    return f"; every finished episode is kept, resume={cli_train.begun[0]} goes on" if cli_train.begun else ""
+
+
+def _always() -> list[str]:
+    """The words of PEGASUS_SETTINGS, which come after those that were typed."""
+    text = os.environ.get("PEGASUS_SETTINGS", "")
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise SettingError(f"PEGASUS_SETTINGS={text} cannot be read: {error}; expected key=value words") from error
+
+
+def _remember_compilations() -> None:
+    """Keep compiled programs in the user's cache folder, unless JAX, which is not imported yet, is told where.
+
+    In none that is unsafe.
+    """
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR", cache.folder())
+    if not folder or "://" in folder:
+        return
+    if problem := cache.problem(Path(folder)):
+        print(f"{folder} {problem}; programs are compiled as if for the first time", file=sys.stderr)
+        os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "false"
+    elif "JAX_COMPILATION_CACHE_DIR" not in os.environ:
+        os.environ["JAX_COMPILATION_CACHE_DIR"] = folder
+        os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")

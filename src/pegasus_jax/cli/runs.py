@@ -1,0 +1,100 @@
+"""The commands that look at runs: pegasus-eval, -plot, -play, and -figures, which makes its own."""
+
+import json
+import shlex
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pegasus_jax.checks import SettingError, whole
+
+
+def evaluate(words: Sequence[str]) -> None:
+    run, rest = _run_and(words, {"episodes": "20", "seed": "0", "json": "false", "trial": "last", "mjcf": ""})
+    episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
+    if rest["json"] not in ("true", "false"):
+        raise SettingError(f"json={rest['json']} is neither true nor false")
+    from pegasus_jax.runs.train import evaluate_run
+
+    result = evaluate_run(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None)
+    if rest["json"] == "true":
+        print(json.dumps(result))
+    else:
+        print("\n".join(f"{name:>13}  {value}" for name, value in result.items()))
+
+
+def plot(words: Sequence[str]) -> None:
+    run, _ = _run_and(words, {}, many=True)
+    from pegasus_jax.runs import store
+    from pegasus_jax.viz.learning_curves import seeds_picture
+    from pegasus_jax.viz.run_plots import run_pictures
+
+    if runs := store.seeds_of(run):
+        print(seeds_picture(list(runs.values()), run / "learning.png"))
+        return
+    for path in run_pictures(run, store.task_of(run)):
+        print(path)
+
+
+def play(words: Sequence[str]) -> None:
+    run, rest = _run_and(words, {"episodes": "1", "seed": "0", "trial": "last", "mjcf": ""})
+    episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
+    from pegasus_jax.viz.video import film
+
+    print(film(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None))
+
+
+def figures(words: Sequence[str]) -> None:
+    from pegasus_jax.runs import config_io
+    from pegasus_jax.runs.programs import share_processors
+    from pegasus_jax.studies import claims, comparison
+    from pegasus_jax.studies.figures import read
+    from pegasus_jax.studies.study import seed_list
+
+    files = [word for word in words if "=" not in word]
+    if len(files) != 1:
+        raise SettingError(f"name one file, not {len(files)}; for example benchmarks/figures/crn.toml")
+    options, changed = config_io.split([word for word in words if "=" in word], comparison.OPTIONS)
+    asked: dict[str, Any] = dict(seeds=options.get("seeds", ""), changes=[f"{k}={v}" for k, v in changed.items()])
+    only = [label for label in options.get("variants", "").split(",") if label]
+    figure, out = read(Path(files[0])), Path(options.get("out", "runs/figures"))
+    share_processors(len(seed_list(asked["seeds"] or figure.seeds)))
+    there = comparison.run(figure, out, only=only, command=shlex.join(["pegasus-figures", *words]), **asked)
+    for line in comparison.differences(figure, there, **asked):
+        print(line, file=sys.stderr)
+    print(claims.markdown(claims.variants_table(figure, out)))
+    if figure.claims:
+        print(f"\n{claims.markdown(claims.claims_table(figure, out))}")
+    print(comparison.draw(figure, there, out))
+
+
+def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False) -> tuple[Path, dict[str, str]]:
+    """The run's folder, or with `many` maybe that of several seeds, and the options of a command that reads it."""
+    from pegasus_jax.checks import nearest
+    from pegasus_jax.runs import config_io, store
+
+    named = [word for word in words if "=" not in word]
+    if len(named) != 1:
+        raise SettingError(f"name one run, not {len(named)}; for example runs/cartpole-seed0")
+    _, rest = config_io.split([word for word in words if "=" in word])
+    for key in rest:
+        if key not in defaults:
+            raise SettingError(
+                f"{key} is not an option here; {nearest(key, defaults) if defaults else 'there are none'}"
+            )
+    path = Path(named[0])
+    if runs := store.seeds_of(path):
+        if not many:
+            raise SettingError(f"{path} holds the runs of {len(runs)} seeds; name one, for example {runs[min(runs)]}")
+        return path, defaults | rest
+    return store.existing(path), defaults | rest
+
+
+def _trial(text: str) -> int | str:
+    """The trial whose policy is asked for. Raises SettingError for a text that names none."""
+    if text in ("last", "best"):
+        return text
+    if not text.isdecimal():
+        raise SettingError(f"trial={text} is not a trial; expected a number, best or last")
+    return int(text)

@@ -1,0 +1,210 @@
+"""The command pegasus-sweep: many runs that differ in a few settings, handed to a launcher that exists already."""
+
+import itertools
+import math
+import os
+import re
+import shlex
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pegasus_jax.checks import SettingError, nearest, whole
+from pegasus_jax.cli.main import main
+
+SWEEP = """\
+pegasus-sweep task=NAME [setting=value,value,... ...]     learn with every combination of the values
+
+A setting's values are separated by commas; A-B is every whole number from A to B. Commas inside brackets belong to a
+value: policy.hidden=[50,50],[200,200] are two. Every combination is a pegasus-train with its own folder,
+OUT/SETTING-VALUE_.../seedN, and is checked before the first one starts.
+
+  launcher=print        print the commands, one a line, and run none: for xargs, GNU parallel or any scheduler
+           local        run them here, jobs= at a time
+           slurm        hand them to SLURM as one job array, jobs= at a time, and return
+  jobs=2                how many run at once
+  out=runs/sweep        the folder of all runs; OUT/jobs has what local and slurm jobs printed
+  seeds=, mesh=         of each pegasus-train
+  slurm.KEY=VALUE       any option of sbatch: slurm.partition=gpu slurm.time=120 slurm.gpus_per_node=1
+
+local and slurm need the extra `sweep`: pip install 'pegasus-jax[sweep]'. Everything else is as in pegasus-train --help.
+
+examples
+  pegasus-sweep task=cartpole search.clip=1,10,100 seed=0-2
+  pegasus-sweep task=cartpole policy.hidden=[50,50],[200,200] seed=0-9 | xargs -d '\\n' -P 2 -I{} sh -c {}
+  pegasus-sweep task=cartpole,double_cartpole seeds=10 launcher=slurm slurm.gpus_per_node=1 slurm.time=60
+  pegasus-plot runs/sweep/search.clip-10     the curves of one combination's seeds
+"""
+
+OPTIONS = ("launcher", "jobs", "out", "seeds", "mesh")
+OF_TRAIN = ("seeds", "mesh")  # of those, pegasus-train's
+MOST = 10_000  # runs of a sweep: beyond is a slip of the keyboard
+YEAR = 365 * 24 * 60  # [min]
+PROGRAM = [sys.executable, "-c", "from pegasus_jax.cli import train; train()"]  # pegasus-train, wherever that is
+
+
+class Job(NamedTuple):
+    """One run of a sweep."""
+
+    run: Path
+    words: list[str]  # of pegasus-train
+
+
+def sweep() -> None:
+    """Entry point of pegasus-sweep."""
+    main(handle, SWEEP, stopped="every finished episode is kept, pegasus-train resume=RUN goes on with a run")
+
+
+def values(text: str) -> list[str]:
+    """The values of 'a,[b,c],2-4': split at commas outside brackets, ranges of whole numbers written out."""
+    parts, depth = [""], 0
+    for letter in text:
+        depth += (letter in "[({") - (letter in "])}")
+        if letter == "," and depth == 0:
+            parts.append("")
+        else:
+            parts[-1] += letter
+    ranges = [re.fullmatch(r"(\d+)-(\d+)", part) for part in parts]
+    for part, found in zip(parts, ranges, strict=True):
+        if found and int(found[2]) - int(found[1]) >= MOST:
+            raise SettingError(f"{part} is a range of more than {MOST:,} numbers; give fewer, for example 0-9")
+    return [
+        value
+        for part, found in zip(parts, ranges, strict=True)
+        for value in (map(str, range(int(found[1]), int(found[2]) + 1)) if found else [part])
+    ]
+
+
+def jobs_of(words: dict[str, str], out: Path) -> list[Job]:
+    """Every combination of the values of `words`, in their order, the last changing fastest.
+
+    Raises SettingError where two of them would be the same run.
+    """
+    choices = {key: values(text) for key, text in words.items()}
+    if empty := [key for key, found in choices.items() if not found or "" in found]:
+        raise SettingError(f"{empty[0]}={words[empty[0]]} has an empty value; for example seed=0,1,2 or seed=0-2")
+    if (count := math.prod(map(len, choices.values()))) > MOST:
+        raise SettingError(f"these are {count:,} combinations; a sweep has at most {MOST:,}")
+    swept = [key for key, found in choices.items() if len(found) > 1]
+    jobs = []
+    for combination in itertools.product(*choices.values()):
+        chosen = dict(zip(choices, combination, strict=True))
+        names = [re.sub(r"[^\w.]+", "-", f"{key}-{chosen[key]}").strip("-") for key in swept if key != "seed"]
+        seed = [f"seed{chosen['seed']}"] if "seed" in swept else []
+        run = out.joinpath(*(["_".join(names)] if names else []), *seed)
+        jobs.append(Job(run, [*(f"{key}={value}" for key, value in chosen.items()), f"out={run}"]))
+    counts = Counter(job.run for job in jobs)
+    if twice := next((run for run, count in counts.items() if count > 1), None):
+        raise SettingError(f"two combinations would share the folder {twice}; give each value once")
+    return jobs
+
+
+def check(job: Job) -> None:
+    """Raise SettingError for settings that cannot be, or a folder that holds runs already."""
+    from pegasus_jax import tasks
+    from pegasus_jax.builder import build, set_precision
+    from pegasus_jax.runs import config_io, store
+
+    _, words = config_io.split(job.words, ("out", *OF_TRAIN))
+    config = tasks.pinned(config_io.parse(words, options=OPTIONS))
+    set_precision(config)
+    build(replace(config, seed=0))
+    if store.holds(job.run):
+        raise SettingError(f"{job.run} holds a run already; another out= keeps both")
+
+
+def show(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) -> None:
+    """Print the commands."""
+    del at_once, out, options
+    for job in jobs:
+        print(shlex.join(["pegasus-train", *job.words]))
+
+
+def local(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) -> None:
+    """Run the jobs as processes of this machine. Raises RunError when any failed."""
+    from pegasus_jax.checks import RunError
+
+    del options
+    executor = _executor("local", out)
+    executor.update_parameters(timeout_min=YEAR)  # submitit would end a job after two minutes
+    running: dict[Any, Path] = {}
+    failed: list[Path] = []
+    for job in [*jobs, None]:  # in the end wait for the last ones
+        while len(running) >= at_once or (job is None and running):
+            for submitted in [one for one in running if one.done()]:
+                run = running.pop(submitted)
+                failed += [] if submitted.exception() is None else [run]
+                print(f"{'failed' if run in failed else 'done'}: {run} ({submitted.paths.stdout})", flush=True)
+            time.sleep(0.2)
+        if job is not None:
+            running[executor.submit(_command(job, dict(os.environ)))] = job.run  # submitit's own hides every GPU
+    if failed:
+        raise RunError(f"{len(failed)} of {len(jobs)} runs failed, the first {failed[0]}; see {out / 'jobs'}")
+
+
+def slurm(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) -> None:
+    """Submit the jobs as an array. Raises SettingError where there is no SLURM, or for an option it lacks."""
+    executor = _executor("slurm", out)
+    try:
+        executor.update_parameters(slurm_array_parallelism=at_once, **options)
+    except (NameError, TypeError, ValueError) as error:
+        raise SettingError(f"slurm.: {' '.join(str(error).split())}; for example slurm.time=120") from error
+    with executor.batch():
+        submitted = [executor.submit(_command(job)) for job in jobs]
+    for job, handle in zip(jobs, submitted, strict=True):
+        print(f"{handle.job_id}  {job.run}")
+
+
+LAUNCHERS: dict[str, Callable[[Sequence[Job], int, Path, dict[str, Any]], None]] = {
+    "print": show,
+    "local": local,
+    "slurm": slurm,
+}
+
+
+def handle(words: Sequence[str]) -> None:
+    """Check a sweep, and give it to its launcher. Raises SettingError for what cannot be."""
+    from pegasus_jax.runs import config_io
+
+    options, rest = config_io.split(words, OPTIONS)
+    launcher = options.get("launcher", "print")
+    if launcher not in LAUNCHERS:
+        raise SettingError(f"launcher={launcher} is unknown; {nearest(launcher, LAUNCHERS)}")
+    at_once = whole("jobs", options.get("jobs", "2"))
+    out = Path(options.get("out", "runs/sweep"))
+    of_slurm = {f"slurm_{key[6:]}": value for key, value in rest.items() if key.startswith("slurm.")}
+    if of_slurm and launcher != "slurm":
+        raise SettingError(
+            f"{next(iter(of_slurm)).replace('_', '.', 1)}= is of no use with launcher={launcher}; launcher=slurm"
+        )
+    own = {key: value for key, value in rest.items() if not key.startswith("slurm.")}
+    whole("seeds", options.get("seeds", "1"))
+    jobs = jobs_of(own | {key: options[key] for key in OF_TRAIN if key in options}, out)
+    for job in jobs:
+        check(job)
+    LAUNCHERS[launcher](jobs, at_once, out, of_slurm)
+
+
+def _executor(cluster: str, out: Path) -> Any:
+    """The library's executor. Raises SettingError where it or its cluster is missing."""
+    try:
+        import submitit
+    except ImportError as error:
+        raise SettingError(
+            f"launcher={cluster} needs the extra sweep, pip install 'pegasus-jax[sweep]'; launcher=print needs nothing"
+        ) from error
+    try:
+        return submitit.AutoExecutor(folder=out / "jobs", cluster=cluster)
+    except RuntimeError as error:
+        raise SettingError(f"launcher={cluster}: {' '.join(str(error).split())}; launcher=local is here") from error
+
+
+def _command(job: Job, environment: dict[str, str] | None = None) -> Any:
+    """What a launcher calls: a fresh interpreter, so that no two runs share anything."""
+    from submitit.helpers import CommandFunction
+
+    return CommandFunction([*PROGRAM, *job.words], verbose=False, env=environment)

@@ -1,1 +1,0 @@
-"""Models of the dynamics: each module makes values of `types.Dynamics`."""

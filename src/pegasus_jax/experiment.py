@@ -1,0 +1,312 @@
+"""The loop of Alg. 1 as three seams: collect (the plant), absorb (the data), improve (the mind)."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jax.core import Tracer
+
+from pegasus_jax import episode
+from pegasus_jax.learn import data as dataset
+from pegasus_jax.learn.fit import FitInfo
+from pegasus_jax.learn.search import SearchInfo
+from pegasus_jax.models.calibration import calibration
+from pegasus_jax.types import (
+    Array,
+    Dataset,
+    Dynamics,
+    Episode,
+    Experiment,
+    Fitter,
+    Key,
+    Learner,
+    Params,
+    Policy,
+    Rollout,
+    RunState,
+    Searcher,
+    Successor,
+    Task,
+    Trajectory,
+)
+
+# What the key of a trial is folded with, so that no two draws share a key.
+COLLECT, FIT, SEARCH, IMAGINE, EVALUATE, RESTART, CALIBRATE = range(7)
+
+
+class TrialInfo(NamedTuple):
+    """What a trial of a whole-program study reports."""
+
+    trajectory: Trajectory  # the episode that became data
+    evaluation: Array  # [E, H] costs of episodes that did not
+    fit: FitInfo
+    search: SearchInfo
+
+
+def trial_key(key: Key, trial: Array | int, purpose: int) -> Key:
+    """The key of one purpose in one trial of the run with root key `key`."""
+    return jax.random.fold_in(jax.random.fold_in(key, trial), purpose)
+
+
+def experiment(
+    *,
+    task: Task,
+    dynamics: Dynamics,
+    policy: Policy,
+    fit: Fitter,
+    fit_steps: int,
+    search: Searcher,
+    search_steps: int,
+    search_reset: bool,
+    search_restart: bool,
+    search_goes_on: bool,
+    imagine: Callable[[Key, Params, Params], tuple[Rollout, Array]],
+    explore: Callable[[Key], Array],
+    explore_trials: int,
+    mean_execution: bool,
+    compare: bool,
+    capacity: int,
+) -> Experiment:
+    """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned.
+
+    `imagine(key, policy parameters, belief)` rolls out fresh scenarios -> (rollout, cost [H, K]). With `compare` a new
+    policy takes the old one's place only where it is expected to cost less. With an environment instead of a plant in
+    JAX, `episode` and `collect` are not pure, and `drive` is there.
+    """
+    states, controls = len(task.state_names), len(task.control_names)
+
+    def init(key: Key) -> RunState:
+        model_key, policy_key = jax.random.split(jax.random.fold_in(key, 0))
+        model, controller = dynamics.init(model_key), policy.init(policy_key)
+        return RunState(
+            key,
+            dataset.empty(capacity, states, controls),
+            Learner(model, fit.init(model)),
+            Learner(controller, search.init(controller)),
+            jnp.int32(0),
+            jnp.int32(0),
+        )
+
+    def act(params: Params, key: Key, x: Array) -> Array:
+        return policy.apply(params, None if mean_execution else policy.sample(key), x)
+
+    def one_episode(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
+        """An episode of the policy, or of random controls. One function, because a plant is slow to compile."""
+        plan_key, run_key = jax.random.split(key)
+        plan = explore(plan_key)
+
+        def control(key: Key, t: Array, x: Array) -> Array:
+            return jnp.where(exploring, plan[t], act(policy_params, key, x))
+
+        return episode.run(run_key, control, task)
+
+    # What an episode on an environment asks of JAX, each compiled once.
+    plan_of, noise_of = (
+        jax.jit(explore),
+        jax.jit(lambda key: jax.vmap(policy.sample)(jax.random.split(key, task.horizon))),
+    )
+    react, cost_of = jax.jit(policy.apply), jax.jit(jax.vmap(task.cost))
+
+    def drive(key: Key, policy_params: Params, exploring: bool) -> Episode:
+        """An episode on the environment, with the costs of its rows."""
+        plan_key, seed_key, noise_key = jax.random.split(key, 3)
+        seed = int(jax.random.randint(seed_key, (), 0, 2**31 - 1))
+        plan = np.asarray(plan_of(plan_key))
+        noise = jax.tree.map(np.asarray, noise_of(noise_key))
+        # Compiled before the robot moves: the first control is to be as quick as the others.
+        react(
+            policy_params, None if mean_execution else jax.tree.map(lambda z: z[0], noise), np.zeros(states, np.float32)
+        )
+
+        def control(t: int, x: np.ndarray) -> np.ndarray:
+            if exploring:
+                return plan[t]
+            drawn = None if mean_execution else jax.tree.map(lambda z: z[t], noise)
+            return np.asarray(react(policy_params, drawn, x))
+
+        found = episode.drive(seed, control, task)
+        whole = episode.padded(found.trajectory, task.horizon)
+        cost = np.asarray(cost_of(whole.x[1:]))[: len(found.trajectory.u)]
+        return found._replace(trajectory=found.trajectory._replace(cost=cost))
+
+    def driven(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
+        if isinstance(key, Tracer):
+            raise ValueError(f"task {task.name} has an environment, which nothing can trace: call this outside of jit")
+        found = drive(key, policy_params, bool(exploring))
+        if found.error is not None:
+            raise found.error
+        return episode.padded(found.trajectory, task.horizon)
+
+    def collect(state: RunState) -> Trajectory:
+        """The next episode: random controls in the first trials, the policy's afterwards (Alg. 1 line 3)."""
+        key = trial_key(state.key, state.trial + 1, COLLECT)
+        return run_episode(key, state.policy.params, state.trial < explore_trials)
+
+    run_episode = one_episode if task.environment is None else driven
+
+    def absorb(state: RunState, trajectory: Trajectory) -> RunState:
+        """The run with one more episode in its data (Alg. 1 line 4).
+
+        Raises ValueError for arrays of other shapes, and, outside of jit, for numbers that are not finite and where
+        there is no room left.
+        """
+        check_episode(state, trajectory)
+        return state._replace(data=dataset.add(state.data, trajectory, task.angles), trial=state.trial + 1)
+
+    def learn(state: RunState, steps: int = fit_steps) -> tuple[RunState, FitInfo]:
+        """Fit the model to the data (Alg. 1 line 5)."""
+        learner, info = fit.run(trial_key(state.key, state.trial, FIT), state.model, state.data, steps)
+        return state._replace(model=learner), info
+
+    def adapted(params: Params, data: Dataset) -> Params:
+        return params if policy.adapt is None else policy.adapt(params, data)
+
+    def improve_policy(
+        state: RunState, first: Array | int = 0, steps: int = search_steps
+    ) -> tuple[RunState, SearchInfo]:
+        """Improve the policy in imagination (Alg. 1 line 6), from iteration `first` of the trial's search."""
+        key = trial_key(state.key, state.trial, SEARCH)
+        belief = dynamics.condition(state.model.params, state.data)
+
+        earlier = search_steps * jnp.maximum(state.trial - max(1, explore_trials), 0) if search_goes_on else 0
+        # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
+        # that knows nothing is the better start.
+        fresh = adapted(policy.init(trial_key(state.key, state.trial, RESTART)), state.data) if search_restart else None
+        untrained = (state.trial <= max(1, explore_trials)) & (first == 0)
+        given = optax.tree.where(untrained, adapted(state.policy.params, state.data), state.policy.params)
+        learner, info = search.run(
+            key,
+            state.policy._replace(params=given),
+            belief,
+            first=first,
+            earlier=earlier,
+            steps=steps,
+            rival=fresh,
+            reset=search_reset,
+        )
+        return state._replace(policy=learner), info
+
+    def succeed(state: RunState, incumbent: Params) -> tuple[RunState, Successor]:
+        """The policy that goes on after a search: its own, or the incumbent where that is expected to cost no more.
+
+        Both are imagined on the same fresh scenarios under the new model.
+        """
+        belief = dynamics.condition(state.model.params, state.data)
+        key = trial_key(state.key, state.trial, IMAGINE)
+        rolled, cost = imagine(key, state.policy.params, belief)
+        if not compare:
+            return state._replace(policy_trial=state.trial), Successor(
+                rolled, cost, jnp.full((), jnp.nan), jnp.bool_(True)
+            )
+        old_rolled, old_cost = imagine(key, incumbent, belief)
+        old = jnp.mean(old_cost)
+        replaced = (state.policy_trial == 0) | ~(old <= jnp.mean(cost))
+        rolled, cost, params = optax.tree.where(
+            replaced, (rolled, cost, state.policy.params), (old_rolled, old_cost, incumbent)
+        )
+        state = state._replace(
+            policy=state.policy._replace(params=params),
+            policy_trial=jnp.where(replaced, state.trial, state.policy_trial),
+        )
+        return state, Successor(rolled, cost, old, replaced)
+
+    def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
+        """Fit and search (Alg. 1 lines 5 and 6), unless the next episode is random too: then nothing, and NaN of it."""
+        if explore_trials < 2:
+            return learn_and_improve(state)
+        info = jax.tree.map(_unknown, jax.eval_shape(learn_and_improve, state)[1])
+        return jax.lax.cond(state.trial < explore_trials, lambda old: (old, info), learn_and_improve, state)
+
+    def learn_and_improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
+        state, fitted = learn(state)
+        incumbent = state.policy.params
+        state, searched = improve_policy(state)
+        state = succeed(state, incumbent)[0] if compare else state._replace(policy_trial=state.trial)
+        return state, (fitted, searched)
+
+    def look_ahead(state: RunState) -> tuple[Rollout, Array]:
+        """Rollouts of the policy under scenarios the search has not seen, and their costs [H, K]."""
+        belief = dynamics.condition(state.model.params, state.data)
+        return imagine(trial_key(state.key, state.trial, IMAGINE), state.policy.params, belief)
+
+    def calibrate(state: RunState, trajectory: Trajectory) -> Array:
+        """`calibration` of the model as it is, on the next episode before it is absorbed; NaN before the first fit.
+
+        With a key of its own, so that asking changes nothing.
+        """
+        belief = dynamics.condition(state.model.params, state.data)
+        key = trial_key(state.key, state.trial + 1, CALIBRATE)
+        found = calibration(key, belief, trajectory, dynamics=dynamics, angles=task.angles)
+        return jnp.where(state.trial >= max(1, explore_trials), found, jnp.nan)
+
+    return Experiment(
+        task,
+        dynamics,
+        policy,
+        init,
+        run_episode,
+        collect,
+        absorb,
+        learn,
+        improve_policy,
+        succeed,
+        improve,
+        look_ahead,
+        calibrate,
+        None if task.environment is None else drive,
+    )
+
+
+def check_episode(state: RunState, trajectory: Trajectory) -> None:
+    """Raise ValueError for an episode that is not one of the task's, as far as can be told."""
+    (states, controls), horizon = (state.data.x.shape[1], state.data.u.shape[1]), len(trajectory.u)
+    shapes = dict(x=(horizon + 1, states), u=(horizon, controls), cost=(horizon,))
+    for name, shape in shapes.items():
+        if jnp.shape(getattr(trajectory, name)) != shape:
+            raise ValueError(f"an episode's {name} has shape {jnp.shape(getattr(trajectory, name))}; expected {shape}")
+    if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state.data.size, trajectory))):
+        return
+    length = horizon if trajectory.length is None else int(trajectory.length)
+    for name, rows in (("x", trajectory.x[: length + 1]), ("u", trajectory.u[:length])):
+        for t, i in np.argwhere(~np.isfinite(np.asarray(rows)))[:1]:
+            raise ValueError(f"an episode's {name}[{t}, {i}] is {rows[t, i]}; expected finite numbers")
+    room = len(state.data.x) - int(state.data.size)
+    if length > room:
+        raise ValueError(
+            f"an episode of {length} rows does not fit: {room} are left; Config(trials=...) makes more room"
+        )
+
+
+def _unknown(like: jax.ShapeDtypeStruct) -> Array:
+    """What an info says of what was not done: NaN, or a count of 0."""
+    return jnp.full(like.shape, jnp.nan if jnp.issubdtype(like.dtype, jnp.floating) else 0, like.dtype)
+
+
+def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunState, TrialInfo]:
+    """One round of Alg. 1: collect, absorb, improve; then `episodes` evaluation episodes that are not data."""
+    trajectory = exp.collect(state)
+    state = exp.absorb(state, trajectory)
+    state, (fitted, searched) = exp.improve(state)
+    keys = jax.random.split(trial_key(state.key, state.trial, EVALUATE), episodes)
+    evaluation = jax.vmap(exp.episode, (0, None, None))(keys, state.policy.params, False)
+    return state, TrialInfo(trajectory, evaluation.cost, fitted, searched)
+
+
+def run(exp: Experiment, trials: int, episodes: int = 20) -> Callable[[Key], tuple[RunState, TrialInfo]]:
+    """key -> (state, TrialInfo [T, ...]): a whole run as one function; jit(vmap(run(...)))(keys) is a study."""
+
+    if exp.drive is not None:
+        raise ValueError(f"task {exp.task.name} has an environment, which no program can hold; use pegasus_jax.train")
+    room = jax.eval_shape(exp.init, jax.random.key(0)).data.x.shape[0] // exp.task.horizon
+    if trials > room:
+        raise ValueError(
+            f"trials={trials}: the experiment was built with room for {room} episodes; Config(trials={trials})"
+        )
+
+    def whole(key: Key) -> tuple[RunState, TrialInfo]:
+        return jax.lax.scan(lambda state, _: trial(state, exp, episodes), exp.init(key), None, trials)
+
+    return whole

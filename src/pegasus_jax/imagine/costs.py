@@ -1,0 +1,147 @@
+"""Costs of states, and what a search makes of the costs of K imagined rollouts."""
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax.math.gaussian import saturating_cost, sincos
+from pegasus_jax.math.linalg import cholesky, mean_and_cov
+from pegasus_jax.types import Array
+
+Cost = Callable[[Array], Array]  # x [D] -> scalar
+Error = Callable[[Array], Array]  # x [D] -> e [E], affine in the features of x
+Expected = Callable[[Array, Array], Array]  # (mean [D], cov [D, D]) of a Gaussian state -> scalar
+Aggregate = Callable[[Array], Array]  # costs [H, K] -> scalar
+
+
+def saturating(error: Error, width: Array | float) -> Cost:
+    """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; docs/reference.md 1.3)."""
+
+    def cost(x: Array) -> Array:
+        e = error(x) / width
+        return 1 - jnp.exp(-0.5 * jnp.sum(e * e))
+
+    return cost
+
+
+def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Array, Array]:
+    """(matrix [E, F], offset [E]) with error(x) = matrix @ encode(x, angles) + offset.
+
+    Exact for an error that is affine in the plain entries of x [D] and in the sines and cosines of its angles [rad].
+    """
+    plain = np.array([i for i in range(states) if i not in angles], int)
+    angle = np.array(angles, int)
+    unit = np.eye(states)
+    at = jax.vmap(error)
+    origin = error(jnp.zeros(states))
+    linear = at(jnp.asarray(unit[plain])) - origin
+    up, down = at(jnp.asarray(unit[angle] * np.pi / 2)), at(jnp.asarray(-unit[angle] * np.pi / 2))
+    cosine = (origin - at(jnp.asarray(unit[angle] * np.pi))) / 2
+    return jnp.concatenate([linear, (up - down) / 2, cosine]).T, origin - jnp.sum(cosine, 0)
+
+
+def expected_saturating(error: Error, width: Array | float, angles: tuple[int, ...]) -> Expected:
+    """The expectation of `saturating(error, width)` of a Gaussian state, as PILCO has it (docs/reference.md 1.3).
+
+    The features of the state are taken for Gaussian, with their exact moments: exact without angles, and as close as
+    that is with them.
+    """
+
+    def expected(mean: Array, cov: Array) -> Array:
+        features = sincos(mean, cov, angles)
+        matrix, offset = (a.astype(mean.dtype) for a in affine_error(error, mean.shape[0], angles))
+        return saturating_cost(features.mean, features.cov, matrix, offset, width)
+
+    return expected
+
+
+def widened(error: Error, width: float, angles: tuple[int, ...], factor: Array | float) -> tuple[Cost, Expected]:
+    """`saturating` and `expected_saturating` of the same error, `factor` times as wide."""
+    return saturating(error, width * factor), expected_saturating(error, width * factor, angles)
+
+
+def expected_by_nodes(cost: Cost, states: int, nodes: int = 512) -> Expected:
+    """The expectation of any cost of a Gaussian state x [D]: the mean over as many fixed nodes, at least 2 D.
+
+    Quasi-Monte Carlo with `normal_nodes`: exact for a cost that is a constant, linear or quadratic in x.
+    """
+
+    def expected(mean: Array, cov: Array) -> Array:
+        z = normal_nodes(max(nodes, 2 * states), states)
+        return jnp.mean(jax.vmap(cost)(mean + z.astype(mean.dtype) @ cholesky(cov).T))
+
+    return expected
+
+
+@lru_cache(maxsize=8)
+def normal_nodes(count: int, size: int) -> np.ndarray:
+    """Points [count, size] that stand for a standard normal, whose mean and covariance they have exactly.
+
+    The normal's quantiles of Sobol's sequence, each moved to the middle of its interval, as none may be at 0.
+    """
+    from scipy.stats import norm, qmc  # slow to import, and only a cost of one's own needs them
+
+    intervals = 2 ** (count - 1).bit_length()
+    z = norm.ppf(qmc.Sobol(size, scramble=False).random(count) + 0.5 / intervals)
+    z -= z.mean(0)
+    return np.linalg.solve(np.linalg.cholesky(z.T @ z / count), z.T).T
+
+
+def of_particles(cost: Cost) -> Callable[[Array], Array]:
+    """The cost of every particle: x [H, K, D] -> [H, K]."""
+    return jax.vmap(jax.vmap(cost))
+
+
+def until_stop(costs: Array, x: Array, stop: Callable[[Array], Array], stop_cost: float) -> Array:
+    """Costs [H, K] or [H, 1] of particles x [H, K, D] that end where `stop` says; after that a step costs `stop_cost`.
+
+    A particle goes on after each state with probability 1 - stop(x); the state that ends it still has its own cost.
+    """
+    goes_on = jnp.cumprod(1 - jax.vmap(jax.vmap(stop))(x).astype(costs.dtype), 0)
+    running = jnp.concatenate([jnp.ones_like(goes_on[:1]), goes_on[:-1]])
+    running = running if costs.shape[1] == running.shape[1] else jnp.mean(running, 1, keepdims=True)
+    return running * costs + (1 - running) * stop_cost
+
+
+def of_matched(expected: Expected) -> Callable[[Array], Array]:
+    """The expected cost of the Gaussian with the particles' mean and covariance: x [H, K, D] -> [H, 1]."""
+    return jax.vmap(lambda x: expected(*mean_and_cov(x))[None])
+
+
+def mean(costs: Array) -> Array:
+    """Mean cost a step and particle: what the authors' code minimises."""
+    return jnp.mean(costs)
+
+
+def total(costs: Array) -> Array:
+    """Cost of an episode, averaged over particles: the paper's eq. 1 and Alg. 3 line 15."""
+    return jnp.sum(jnp.mean(costs, 1))
+
+
+def discounted(discount: float, aggregate: Aggregate = mean) -> Aggregate:
+    """The aggregate of costs weighted by discount^t."""
+
+    def weighted(costs: Array) -> Array:
+        return aggregate(costs * discount ** jnp.arange(costs.shape[0], dtype=costs.dtype)[:, None])
+
+    return weighted
+
+
+def worst(fraction: float, aggregate: Aggregate = mean) -> Aggregate:
+    """The aggregate of the costliest `fraction` of the K particles, by mean cost a step: CVaR at level 1 - fraction.
+
+    Where fraction * K is not whole, the last particle counts in part (Rockafellar & Uryasev 2002). A `discounted`
+    around it ranks by discounted cost.
+    """
+
+    def tail(costs: Array) -> Array:
+        particles = costs.shape[1]
+        order = jnp.argsort(-jnp.mean(costs, 0))
+        rank = jnp.argsort(order)  # 0: the costliest
+        share = jnp.clip(fraction * particles - rank, 0, 1) / fraction
+        return aggregate(costs * share)
+
+    return tail

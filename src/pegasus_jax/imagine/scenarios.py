@@ -1,0 +1,92 @@
+"""The only place that draws the noise of imagined rollouts."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.math.linalg import standardise
+from pegasus_jax.sharding import Spread, together
+from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, Scenarios
+
+Block = Callable[[Key, Params], Params]  # (key, belief) -> that part of the scenarios
+
+
+class Blocks(NamedTuple):
+    """How each part of the scenarios is drawn."""
+
+    start: Block
+    dynamics: Block
+    policy: Block
+    sensor: Block
+    match: Block
+
+
+def blocks(
+    *,
+    dynamics: Dynamics,
+    policy: Policy,
+    start: Callable[[Key], Array],
+    particles: int,
+    horizon: int,
+    balanced: bool,
+    spread: Spread = together,
+) -> Blocks:
+    """How each part of the scenarios is drawn.
+
+    With `balanced`, the normal draws of every time step have exactly zero mean and unit covariance over the particles,
+    so that matched particles have exactly the moments asked for. `spread` lays particles out over devices (mesh.py).
+    """
+
+    deal = dynamics.deal or jax.vmap(dynamics.sample, (0, None))
+
+    def each(sample: Callable[[Key], Params], key: Key) -> Params:
+        return spread(sample(jax.random.split(key, particles)), 0)
+
+    def normal(key: Key, _: Params) -> Array:
+        states = jax.eval_shape(start, key).shape[0]
+        # Drawn as one long row: the same numbers, by loops that need not stop every few dimensions.
+        z = jax.random.normal(key, (horizon * particles * states,)).reshape(horizon, particles, states)
+        return spread(standardise(z) if balanced else z, 1)
+
+    return Blocks(
+        start=lambda key, _: each(jax.vmap(start), key),
+        dynamics=lambda key, belief: each(lambda keys: deal(keys, belief), key),
+        policy=lambda key, _: each(jax.vmap(policy.sample), key),
+        sensor=normal,
+        match=normal,
+    )
+
+
+def draw(key: Key, step: Array | int, belief: Params, *, blocks: Blocks, period: Period) -> Scenarios:
+    """The scenarios in force at a search iteration.
+
+    Block b at iteration i is drawn from fold_in(fold_in(key, b), i // period_b): any iteration's scenarios can be had
+    without those before it, so a search may stop and go on anywhere.
+    """
+    epochs = jnp.stack([_epoch(step, every) for every in period])
+    folded = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(blocks)))  # all at once: quick to compile
+    keys = jax.vmap(jax.random.fold_in)(folded, epochs)
+    return Scenarios(*(sample(keys[i], belief) for i, sample in enumerate(blocks)))
+
+
+def redraw(key: Key, step: Array, scenarios: Scenarios, belief: Params, *, blocks: Blocks, period: Period) -> Scenarios:
+    """`draw` for the iteration after the one whose scenarios are given; draws only the blocks that change."""
+    renewed = {}
+    for every in sorted(set(period) - {0}):
+        names = [name for name, p in zip(Scenarios._fields, period, strict=True) if p == every]
+
+        def fresh(names: list[str] = names) -> dict[str, Params]:
+            drawn = draw(key, step, belief, blocks=blocks, period=period)  # the blocks not asked for are dead code
+            return {name: getattr(drawn, name) for name in names}
+
+        def held(names: list[str] = names) -> dict[str, Params]:
+            return {name: getattr(scenarios, name) for name in names}
+
+        renewed |= fresh() if every == 1 else jax.lax.cond(step % every == 0, fresh, held)
+    return scenarios._replace(**renewed)
+
+
+def _epoch(step: Array | int, every: int) -> Array:
+    return jnp.asarray(step // every if every else 0, jnp.uint32)

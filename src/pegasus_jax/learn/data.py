@@ -1,0 +1,42 @@
+"""The experience so far, in arrays of fixed capacity."""
+
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.math.angles import difference
+from pegasus_jax.types import Array, Batch, Dataset, Key, Trajectory
+
+
+def empty(capacity: int, states: int, controls: int) -> Dataset:
+    """A data set of `capacity` rows, none in use."""
+    zeros = jnp.zeros
+    return Dataset(zeros((capacity, states)), zeros((capacity, controls)), zeros((capacity, states)), jnp.int32(0))
+
+
+def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...]) -> Dataset:
+    """The data set with the transitions of an episode behind it (Alg. 1 line 4).
+
+    Of an episode that ended early only the rows that took place. Rows for which there is no room are left out, and what
+    is there stays: the caller sizes a data set for the whole run (trials x horizon).
+    """
+    horizon, capacity = trajectory.u.shape[0], data.x.shape[0]
+    length = horizon if trajectory.length is None else trajectory.length
+    rows = jnp.arange(horizon)
+    place = jnp.where(rows < length, data.size + rows, capacity)  # beyond the end: dropped
+    y = difference(trajectory.x[1:], trajectory.x[:-1], angles)
+    new = trajectory.x[:-1], trajectory.u, y
+    x, u, y = (old.at[place].set(rows, mode="drop") for old, rows in zip(data[:3], new, strict=True))
+    return Dataset(x, u, y, jnp.minimum(data.size + length, capacity).astype(jnp.int32))
+
+
+def grow(data: Dataset, capacity: int) -> Dataset:
+    """The same data with room for `capacity` rows, at least as many as now."""
+    more = capacity - data.x.shape[0]
+    x, u, y = (jnp.pad(rows, ((0, more), (0, 0))) for rows in data[:3])
+    return Dataset(x, u, y, data.size)
+
+
+def minibatch(key: Key, data: Dataset, rows: int) -> Batch:
+    """`rows` rows drawn with replacement from those in use."""
+    index: Array = jax.random.randint(key, (rows,), 0, data.size)
+    return Batch(data.x[index], data.u[index], data.y[index])

@@ -1,0 +1,82 @@
+"""A network with multiplicative noise on its units, and what eq. 2 charges for its weights and for that noise."""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.models.network import MLP
+from pegasus_jax.types import Array, Dropout, Key, Params, Prediction
+
+Masks = list[Array | None]  # what multiplies each layer's inputs [width]; None: nothing does
+
+Head = Callable[[Array], Array]  # raw output [D] -> noise std as a fraction of the target's scale
+
+HEADS: dict[str, Head] = {
+    # At most a tenth of the target's scale, as in the authors' final code (docs/reference.md 4.5).
+    "sigmoid": lambda raw: 0.1 * jax.nn.sigmoid(raw) + 1e-6,
+    "softplus": lambda raw: jax.nn.softplus(raw) + 1e-6,
+}
+
+
+class Noisy(NamedTuple):
+    """A distribution over networks; its parameters are {"network": weights, "noise": one entry a layer}."""
+
+    init: Callable[[Key], dict[str, Params]]
+    apply: Callable[[Params, Array, Masks], Any]  # (weights, inputs [..., F], masks) -> outputs [..., O]
+    # (key, noise) -> masks [width] of one network; (key, noise, M) -> masks [M, width] of one a row
+    sample: Callable[..., Masks]
+    penalty: Callable[[dict[str, Params]], Array]  # KL of the noise + weight prior (docs/reference.md 4.4) [nats]
+
+
+def noisy(
+    *,
+    features: int,
+    hidden: tuple[int, ...],
+    outputs: int,
+    dropout: Dropout,
+    input_dropout: Dropout | None = None,
+    kl_weight: float = 1.0,
+    weight_decay: float = 1.0,
+    activation: str = "relu",
+    initialiser: str = "glorot",
+) -> Noisy:
+    """Layer i multiplies its input by noise of `dropout`; the network's own inputs carry `input_dropout`, or none.
+
+    `kl_weight` and `weight_decay` scale the KL of the noise and the Gaussian weight prior.
+    """
+    network = MLP(hidden, outputs, initialiser, activation)
+    kinds = (input_dropout, *(dropout for _ in hidden))
+    widths = (features, *hidden)
+
+    def init(key: Key) -> dict[str, Params]:
+        net_key, *keys = jax.random.split(key, 1 + len(kinds))
+        noise = tuple(k.init(kk, w) if k else {} for k, kk, w in zip(kinds, keys, widths, strict=True))
+        return {"network": network.init(net_key, jnp.zeros(features), [None] * len(kinds)), "noise": noise}
+
+    def sample(key: Key, params: Params, *rows: int) -> Masks:
+        keys = jax.random.split(key, len(kinds))
+
+        def mask(kind: Dropout | None, params: Params, key: Key, width: int) -> Array | None:
+            # Base noise is independent over units, so that of M rows is that of one layer M times as wide.
+            return kind.mask(params, kind.sample(key, math.prod(rows) * width).reshape(*rows, width)) if kind else None
+
+        return [mask(*layer) for layer in zip(kinds, params, keys, widths, strict=True)]
+
+    def penalty(params: dict[str, Params]) -> Array:
+        kl = sum(k.kl(p) for k, p in zip(kinds, params["noise"], strict=True) if k)
+        prior = jnp.zeros(())
+        for i, (kind, noise) in enumerate(zip(kinds, params["noise"], strict=True)):
+            layer = params["network"]["params"][f"layer_{i}"]
+            retained = kind.decay(noise) if kind else jnp.ones(widths[i])
+            prior += 0.5 * jnp.sum(retained * jnp.sum(layer["kernel"] ** 2, 1)) + 0.5 * jnp.sum(layer["bias"] ** 2)
+        return kl_weight * kl + weight_decay * prior
+
+    return Noisy(init, network.apply, sample, penalty)
+
+
+def misfit(predicted: Prediction, y: Array) -> Array:
+    """-log likelihood a row of changes y [M, D], in raw units, without its 2 pi: the first term of eq. 2 by N."""
+    return jnp.mean(jnp.sum(0.5 * ((y - predicted.mean) / predicted.std) ** 2 + jnp.log(predicted.std), -1))

@@ -1,0 +1,59 @@
+"""A ReLU network controller, with multiplicative noise on its hidden units or without."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.models.network import MLP
+from pegasus_jax.policies.scaled import of_data, scaled, unscaled
+from pegasus_jax.types import Array, Dataset, Dropout, Key, Params, Policy
+
+
+def mlp(
+    *,
+    encode: Callable[[Array], Array],
+    features: int,
+    controls: int,
+    hidden: tuple[int, ...],
+    dropout: Dropout,
+    saturate: Callable[[Array], Array],
+    initialiser: str,
+    input_scale: Array | float = 1.0,
+    output_scale: float = 1.0,
+) -> Policy:
+    """u = saturate(network(encode(x) * input_scale)); noise is on each hidden layer's output (docs/reference.md 5.1).
+
+    What the data have large is standardised on its way in, see `scaled`.
+    `output_scale` multiplies the last layer's initial weights: how far from the middle of the limits, and how near to
+    saturation, a policy starts.
+    """
+    network = MLP(hidden, controls, initialiser)
+
+    def init(key: Key) -> Params:
+        net_key, *keys = jax.random.split(key, 1 + len(hidden))
+        net: Any = network.init(net_key, jnp.zeros(features), [None] * (len(hidden) + 1))
+        last = f"layer_{len(hidden)}"
+        net["params"][last]["kernel"] = net["params"][last]["kernel"] * output_scale
+        noise = tuple(dropout.init(k, w) for k, w in zip(keys, hidden, strict=True))
+        return {"network": net, "noise": noise, "input": unscaled(features)}
+
+    def adapt(params: Params, data: Dataset) -> Params:
+        return params | {"input": of_data(encode(data.x) * input_scale, data.size)}
+
+    def sample(key: Key) -> tuple[Array, ...]:
+        keys = jax.random.split(key, len(hidden))
+        return tuple(dropout.sample(k, w) for k, w in zip(keys, hidden, strict=True))
+
+    def apply(params: Params, noise: tuple[Array, ...] | None, x: Array) -> Array:
+        """u [U]; noise None is the mean policy, every unit at its expected size."""
+        if noise is None:
+            masks = [dropout.retain(p) for p in params["noise"]]
+        else:
+            masks = [dropout.mask(p, z) for p, z in zip(params["noise"], noise, strict=True)]
+        inputs = scaled(params["input"], encode(x) * input_scale)
+        out: Any = network.apply(params["network"], inputs, [None, *masks])
+        return saturate(out)
+
+    return Policy(init, sample, apply, adapt=adapt)

@@ -1,0 +1,21 @@
+"""A controller from somebody else's network: a Flax module's, or any pair of functions."""
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+
+from pegasus_jax.math.angles import encode
+from pegasus_jax.policies.squash import SQUASHES, to_limits
+from pegasus_jax.types import Array, Key, Params, Policy, Task
+
+
+def of_pair(
+    init: Callable[[Key], Params], apply: Callable[[Params, Array], Array], task: Task, squash: str = "tanh"
+) -> Policy:
+    """u = apply(params, features [F]) [U], any real numbers, saturated to the task's limits by tanh or sine.
+
+    The features are those of every other controller: the state with its angles as sines and cosines (`angles.encode`).
+    """
+    low, high = jnp.asarray(task.control_low, float), jnp.asarray(task.control_high, float)
+    saturate = to_limits(SQUASHES[squash], low, high)
+    return Policy(init, lambda key: (), lambda params, noise, x: saturate(apply(params, encode(x, task.angles))))

@@ -1,0 +1,136 @@
+"""pegasus-check: what a task is like, and what would go wrong, before anything moves; pegasus-train asks it first."""
+
+from dataclasses import replace
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax.tasks import cost_check, user_code
+from pegasus_jax import tasks
+from pegasus_jax.checks import SettingError
+from pegasus_jax.config import Config
+from pegasus_jax.types import Task
+
+RESETS = 20  # of an environment that may be reset without need
+EXACT = 1e-4  # of an entry's spread: what is left of it is rounding
+
+
+def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
+    """Notes on a task of the user's, one line each; opens its environment and resets it so many times.
+
+    Raises SettingError, in one line, for a cost that cannot be learned from and readings that cannot be right. The cost
+    is looked at first: a mistake in it moves no robot.
+    """
+    if config.task not in (tasks.GYM, tasks.MJCF):
+        return []
+    low, high = tasks.observation_limits(config, task)
+    facts = cost_check.Facts(
+        np.asarray(task.start_mean, float),
+        np.asarray(task.start_std, float),
+        task.angles,
+        low,
+        high,
+        np.zeros((0, len(task.state_names))),
+        task.success,
+    )
+    notes = cost_check.notes(task.cost, facts, f"cost={config.cost}")
+    stopping(config, task)
+    tasks.compared(config, task)
+    readings = tasks.readings(config, task, resets)
+    return [*notes, *plausible(readings, facts), *alike(readings, task.angles)]
+
+
+def stopping(config: Config, task: Task) -> None:
+    """Raises SettingError unless the task's `stop` is one probability, and its episodes do not end where they start."""
+    if task.stop is None:
+        return
+    what = f"stop={config.stop}"
+    with user_code.blamed(what, task.stop):
+        value = jnp.asarray(task.stop(jnp.asarray(task.start_mean, float)))
+    if value.shape != ():
+        raise SettingError(f"{what} returns an array of shape {value.shape}; expected one number in [0, 1], or a bool")
+    if not 0 <= float(value) <= 1:
+        raise SettingError(f"{what} is {float(value):g} at the start; expected a probability in [0, 1], or a bool")
+    if float(value) > 0.5:
+        raise SettingError(f"{what} is {float(value):g} at the start: every episode would end there")
+
+
+def plausible(readings: np.ndarray, facts: cost_check.Facts) -> list[str]:
+    """Notes on angles that are large for radians. Raises SettingError for those that must be degrees.
+
+    readings: [N, D] of resets
+    """
+    notes = []
+    for entry in facts.angles:
+        seen = [*readings[:, entry], facts.start_mean[entry]]
+        largest = float(max(seen, key=abs))
+        text = f"angles=[{entry}]: x{entry} is {largest:.4g} at the start"
+        if abs(largest) > 4 * np.pi:
+            raise SettingError(f"{text}, more than two turns in radians; degrees? Return np.deg2rad of it")
+        if abs(largest) > 2 * np.pi:
+            notes.append(f"{text}, more than a turn in radians; are these degrees?")
+    return notes
+
+
+def alike(readings: np.ndarray, angles: tuple[int, ...] = ()) -> list[str]:
+    """Notes on entries of readings [N, D] that never change, and on those that follow from others."""
+    count, size = readings.shape
+    if count < 3:
+        return []
+    spread = np.ptp(readings, axis=0)
+    still = spread <= 1e-6 * np.maximum(1, np.abs(readings).max(0))
+    notes = []
+    if still.any():
+        names = ", ".join(f"x{i}" for i in np.flatnonzero(still))
+        notes.append(f"after each of {count} resets the same: {names}; what never changes only costs time")
+    features = {f"x{i}": readings[:, i] for i in range(size) if not still[i]}
+    for i in range(size):
+        earlier = {name: value for name, value in features.items() if int(name[1:]) < i}
+        earlier |= {f"{f.__name__}(x{a})": f(readings[:, a]) for a in angles if a != i for f in (np.sin, np.cos)}
+        if not still[i] and (names := _explained(readings[:, i], earlier)):
+            notes.append(f"x{i} follows from {names} in all of {count} resets; one of them is enough")
+    return notes
+
+
+def _explained(column: np.ndarray, others: dict[str, np.ndarray]) -> str:
+    """The one of the others [N], or all of them, of which a column [N] is a linear function; "" where it is none."""
+    every = [[name] for name in others] + ([list(others)] if len(column) > len(others) + 2 else [])
+    for names in every:
+        basis = np.column_stack([np.ones(len(column)), *(others[name] - others[name].mean() for name in names)])
+        rest = column - basis @ np.linalg.lstsq(basis, column, rcond=None)[0]
+        if np.ptp(rest) < EXACT * np.ptp(column):
+            return ", ".join(names)
+    return ""
+
+
+def report(config: Config) -> list[str]:
+    """What a task is like, line by line. Its environment is opened, reset, not driven, and closed.
+
+    Raises SettingError, in one line, for what cannot be learned.
+    """
+    from pegasus_jax.builder import build, set_precision
+
+    given = bool(config.start_mean)
+    set_precision(config)
+    config = tasks.pinned(config)
+    task = build(replace(config, seed=0)).task
+    notes = before_training(config, task, 1 if given else RESETS)
+    start = jnp.asarray(task.start_mean, float)
+    facts: dict[str, Any] = {
+        "task": " ".join([config.task, *([task.name] if task.name != config.task else [])]),
+        **tasks.described(config),
+        "observation": ", ".join(task.state_names),
+        "control": ", ".join(
+            f"{name} from {low:g} to {high:g}"
+            for name, low, high in zip(task.control_names, task.control_low, task.control_high, strict=True)
+        ),
+        "time": f"{task.horizon} periods of {task.dt:g} s an episode, {task.horizon * task.dt:g} s",
+        "start": f"{_numbers(task.start_mean)}, give or take {_numbers(task.start_std)}",
+        "cost there": f"{float(task.cost(start)):.4g}; below {task.success:g} is success",
+    }
+    return [*(f"{name:>12}  {value}" for name, value in facts.items()), *(f"{'note':>12}  {note}" for note in notes)]
+
+
+def _numbers(values: Any) -> str:
+    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"

@@ -1,0 +1,209 @@
+"""The command line's `key=value` words -> a checked Config, through OmegaConf's structured configs."""
+
+import dataclasses
+import json
+from collections.abc import Sequence
+from difflib import get_close_matches
+from fnmatch import fnmatch
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from pegasus_jax.checks import SettingError, called, nearest, shown
+from pegasus_jax.config import Config
+from pegasus_jax.defaults import BEST, NAMES, defaults
+from pegasus_jax.runs.files import write_whole
+from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
+
+# Keys that select a named variant, and what they select from.
+VARIANTS: dict[str, Any] = {"task": NAMES, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
+
+
+def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, str], dict[str, str]]:
+    """(options, settings) of `key=value` words. Raises SettingError for a word that is not of that form."""
+    known, rest = {}, {}
+    for word in words:
+        key, equals, value = word.partition("=")
+        if not equals or not key:
+            if any(part.startswith("=") or part.endswith("=") for part in words):
+                raise SettingError(
+                    f"'{word}' is not of the form key=value; write no spaces around =, as in task=cartpole"
+                )
+            choices = [*options, *VARIANTS, *leaves(Config())]
+            raise SettingError(f"'{word}' is not of the form key=value; {_hint(word.lstrip('-'), choices)}")
+        (known if key in options else rest)[key] = value
+    return known, rest
+
+
+def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
+    """The config of a command line: defaults, then the variants' and the task's, then the dotted settings."""
+    words = _with_arguments(words)
+    chosen = {name: words.pop(name) for name in VARIANTS if name in words}
+    for name, value in chosen.items():
+        if value not in VARIANTS[name]:
+            raise SettingError(f"{name}={value} is unknown; {nearest(value, VARIANTS[name])}")
+    task, algorithm = chosen.get("task", Config.task), chosen.get("algorithm", "pegasus")
+    # What suits a task best goes with the best algorithm and where no model is named; the rest is the paper's.
+    own = algorithm == "pegasus" and "model" not in chosen
+    best, changes = BEST.get(task, ("log_normal", {})) if own else (chosen.get("model", "log_normal"), {})
+    variants: dict[str, Any] = {
+        **MODELS[best],
+        **changes,
+        **ALGORITHMS[algorithm],
+        **(POLICIES[chosen["policy"]] if "policy" in chosen else {}),
+    }
+    sections = {name: value for name, value in variants.items() if dataclasses.is_dataclass(value)}
+    config = dataclasses.replace(Config(task=task), **sections)
+    config = override(config, values({key: words[key] for key in ("legs",) if key in words}))
+    for changes in (defaults(config.task, config.legs), {k: v for k, v in variants.items() if k not in sections}):
+        there = leaves(config)
+        config = override(config, {key: value for key, value in changes.items() if key in there})
+    known, of_some = leaves(config), used_by()
+    for key in words:
+        if key not in known:
+            raise SettingError(f"{key} is not a setting; {_hint(key, [*known, *VARIANTS, *options])}")
+        if task not in of_some.get(key, (task,)):
+            raise SettingError(
+                f"{key}={shown(words[key])} is of no use with task={task}; the nearest task that uses it is"
+                f" task={_nearest_of(task, of_some[key])}"
+            )
+    return override(config, values(words))
+
+
+def used_by() -> dict[str, tuple[str, ...]]:
+    """Setting -> the tasks that use it, of those settings that not every task uses."""
+    patterns = {f.name: f.metadata.get("of", ()) for f in dataclasses.fields(Config)}
+    return {
+        name: tuple(task for task in NAMES if any(fnmatch(task, pattern) for pattern in of))
+        for name, of in patterns.items()
+        if of
+    }
+
+
+def _nearest_of(task: str, choices: Sequence[str]) -> str:
+    return (get_close_matches(task, choices, n=1) or [choices[0]])[0]
+
+
+def _with_arguments(words: dict[str, str]) -> dict[str, str]:
+    """The words, with those of env_args.NAME=VALUE as one list."""
+    prefix = "env_args."
+    given = [f"{key.removeprefix(prefix)}={value}" for key, value in words.items() if key.startswith(prefix)]
+    rest = {key: value for key, value in words.items() if not key.startswith(prefix)}
+    return rest | ({"env_args": json.dumps(given)} if given else {})
+
+
+def values(words: dict[str, str]) -> dict[str, Any]:
+    """What the texts on the right of `key=` mean, read as YAML."""
+    return {key: _value(key, text) for key, text in words.items()}
+
+
+def override(config: Config, changes: dict[str, Any]) -> Config:
+    """The config with dotted settings changed, all at once; each value becomes its setting's type, or is refused."""
+    return _changed(config, changes, "")
+
+
+def leaves(node: Any, prefix: str = "") -> dict[str, Any]:
+    """Dotted name -> value of every setting under a config dataclass."""
+    found: dict[str, Any] = {}
+    for f in dataclasses.fields(node):
+        value = getattr(node, f.name)
+        if dataclasses.is_dataclass(value):
+            found |= leaves(value, f"{prefix}{f.name}.")
+        else:
+            found[prefix + f.name] = value
+    return found
+
+
+def plain(config: Config) -> dict[str, Any]:
+    """`leaves` as YAML and JSON have them: with lists, not tuples."""
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in leaves(config).items()}
+
+
+def help_lines(node: Any, prefix: str = "") -> list[str]:
+    """One line a setting: name=default and what it is for."""
+    lines: list[str] = []
+    for f in dataclasses.fields(node):
+        value = getattr(node, f.name)
+        if dataclasses.is_dataclass(value):
+            lines += help_lines(value, f"{prefix}{f.name}.")
+        elif f"{prefix}{f.name}" not in VARIANTS and f.metadata["help"]:
+            lines.append(f"  {prefix + f.name + '=' + shown(value):34s} {f.metadata.get('help', '')}")
+    return lines
+
+
+def save(config: Config, path: Path) -> None:
+    """Write the resolved config as YAML that `load` reads; the file appears whole or not at all."""
+    text = OmegaConf.to_yaml(OmegaConf.create(plain(config)))
+    write_whole(path, lambda file: file.write(text.encode()))
+
+
+def load(path: Path) -> Config:
+    """The config that `save` wrote. Raises SettingError when it is not one.
+
+    A setting that the file lacks is younger than the run, and its default leaves everything as it was.
+    """
+    try:
+        stored: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+    except (OSError, ValueError, RecursionError, OmegaConfBaseException, YAMLError) as error:
+        raise SettingError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+    if not isinstance(stored, dict) or "task" not in stored:
+        raise SettingError(f"{path} is not the config of a run")
+    chosen = {section: stored.get(f"{section}.kind") for section in KINDS}
+    for section, kind in chosen.items():
+        if kind not in (None, *KINDS[section]):
+            raise SettingError(f"{path}: {section}.kind={kind} is unknown; {nearest(kind, KINDS[section])}")
+    config = Config(**{section: KINDS[section][kind] for section, kind in chosen.items() if kind is not None})
+    wrong = sorted(set(map(str, stored)) - set(leaves(config)))
+    if wrong:
+        raise SettingError(f"{path} is not the config of a run of this version: see {', '.join(wrong[:5])}")
+    try:
+        return override(config, stored)
+    except SettingError as error:
+        raise SettingError(f"{path}: {error}") from error
+
+
+def _hint(key: str, choices: Sequence[str]) -> str:
+    """The nearest choice; all of them only when they are few."""
+    text = nearest(key, choices).removesuffix(f"choices: {', '.join(choices)}")
+    return f"{text}--help lists all settings"
+
+
+def _value(key: str, text: str) -> Any:
+    try:
+        return OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]))["value"]  # type: ignore[index,call-overload]
+    except Exception as error:
+        raise SettingError(f"{key}={shown(text)} cannot be read as a value") from error
+
+
+def _changed(node: Any, changes: dict[str, Any], prefix: str) -> Any:
+    """A copy of the dataclass with dotted fields changed together: some limit each other."""
+    here: dict[str, Any] = {}
+    below: dict[str, dict[str, Any]] = {}
+    for key, value in changes.items():
+        head, _, rest = key.partition(".")
+        if rest:
+            below.setdefault(head, {})[rest] = value
+        else:
+            here[head] = _converted(node, head, value, prefix + head)
+    here |= {head: _changed(getattr(node, head), inner, f"{prefix}{head}.") for head, inner in below.items()}
+    return dataclasses.replace(node, **here)
+
+
+def _converted(node: Any, name: str, value: Any, key: str) -> Any:
+    """The value as the type of the dataclass's field of that name."""
+    if "${" in str(value):  # OmegaConf would put another setting there, or a variable of the environment
+        raise SettingError(f"{key}={shown(value)} is not a value but a reference to one; write the value itself")
+    current = getattr(node, name)
+    field = next(f for f in dataclasses.fields(node) if f.name == name)
+    schema = OmegaConf.structured(dataclasses.make_dataclass("One", [(name, field.type, current)]))
+    try:
+        merged = OmegaConf.merge(schema, {name: value})
+        assert isinstance(merged, DictConfig)
+        return getattr(OmegaConf.to_object(merged), name)
+    except (OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
+        raise SettingError(
+            f"{key}={shown(value)} is not {called(field.type)}; for example {key}={shown(current)}"
+        ) from error

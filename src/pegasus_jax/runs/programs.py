@@ -1,0 +1,292 @@
+"""The compiled parts of an experiment, for one seed or for many at once, and the clock on them."""
+
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import AbstractContextManager, nullcontext
+from functools import cache, partial
+from importlib.metadata import entry_points
+from threading import Thread
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental import multihost_utils
+from jax.sharding import Mesh, NamedSharding
+
+from pegasus_jax import interrupt, sharding
+from pegasus_jax.episode import trimmed
+from pegasus_jax.runs.machine import processors
+from pegasus_jax.types import Episode, Experiment, Params, Trajectory
+
+NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
+
+# How a GPU runs loops: whole, as graphs of kernels, so that no round waits for the host. The compiler's usual kinds of
+# kernels are listed because WHILE alone would leave them out.
+GRAPHS = {
+    "xla_gpu_enable_command_buffer": "CONDITIONAL,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,FUSION,WHILE"
+}
+# And side by side the kernels of a graph that do not wait for each other (docs/decisions/0013).
+ABREAST = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+
+# The compiler's options by platform. On a processor what runs for milliseconds need not be compiled well: without
+# emitters it is ready in two thirds of the time, and a tenth slower. A fit or a search runs for seconds, and gains by
+# wide vectors; the compiler's highest level gains it nothing over the first, which takes a tenth less.
+BRIEFLY: dict[str, dict] = {
+    "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
+    "gpu": GRAPHS | ABREAST,
+}
+LASTING: dict[str, dict] = {
+    "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512},
+    "gpu": GRAPHS | ABREAST,
+}
+LONG = ("fit", "search")
+FEW = 128  # particles that one thread of a processor imagines as fast as two
+
+
+class Jitted:
+    """A jitted function that says how long its caller waited for compiling; compiles once, or it is a defect."""
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
+        self.coming: Future | None = None
+
+    def ready(self, *arguments: Any) -> None:
+        """Wait until it is compiled for arguments of these shapes."""
+        if self.compiled is None:
+            began = time.monotonic()
+            # Traced here, where JAX has its caller's settings, and compiled elsewhere.
+            self.compiled = (self.coming or begun(self.function.lower(*arguments).compile)).result()
+            self.seconds = time.monotonic() - began
+
+    def __call__(self, *arguments: Any) -> Any:
+        self.ready(*arguments)
+        compiled: Any = self.compiled
+        return begun(lambda: jax.block_until_ready(compiled(*arguments))).result()
+
+    def compile(self, *arguments: Any) -> Any:
+        """The function compiled for arguments of these shapes."""
+        return self.function.lower(*arguments).compile()
+
+
+class Program:
+    """An experiment over S seeds: every argument and result has a leading axis [S], except those that all share.
+
+    With a mesh, the seeds lie on its devices; those of several processes call every part together.
+    """
+
+    def __init__(
+        self,
+        experiment: Experiment,
+        search_steps: int,
+        seeds: int = 1,
+        over: Mesh | None = None,
+        side_by_side: bool | None = None,
+    ) -> None:
+        self.mesh, self.seeds = over, seeds
+        self.drive, self.horizon = experiment.drive, experiment.task.horizon
+        # Evaluation episodes. A GPU takes as long for one as for twenty; a CPU does not, and would have one more
+        # program to compile.
+        self.side_by_side = jax.default_backend() != "cpu" if side_by_side is None else side_by_side
+        self.chunk = chunk(search_steps)
+        self.chunks = search_steps // self.chunk
+        functions = {
+            "init": (experiment.init, (0,)),
+            "episode": (experiment.episode, (0, 0, None)),
+            "evaluate": (jax.vmap(experiment.episode, (0, None, None)), (0, 0, None)),
+            "absorb": (experiment.absorb, (0, 0)),
+            "fit": (experiment.fit, (0,)),
+            "search": (partial(experiment.search, steps=self.chunk), (0, None)),
+            "succeed": (experiment.succeed, (0, 0)),
+            "calibrate": (experiment.calibrate, (0, 0)),
+        }
+        self.axes = {name: axes for name, (_, axes) in functions.items()}
+        layout = {} if over is None else {"out_shardings": sharding.over_seeds(over)}
+        self.parts = {
+            name: Jitted(
+                over_seeds(function, axes, seeds=seeds, over=over),
+                compiler_options=compiler_options(LASTING if name in LONG else BRIEFLY),
+                **layout,
+            )
+            for name, (function, axes) in functions.items()
+        }
+        self.spent: dict[str, float] = {}
+        # Told of a part while its caller waits for the compiler; whoever shows progress puts its own here.
+        self.on_compile: Callable[[str], AbstractContextManager[Any]] = nullcontext
+
+    def prepare(self, part: str, *others: Any) -> None:
+        """Begin to compile a part of states and `others`, or of states and a whole number, while others are at work."""
+        jitted = self.parts[part]
+        if jitted.compiled or jitted.coming:
+            return
+        keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), self.seeds))
+        states = self.parts["init"].function.eval_shape(keys)
+        rest = others or tuple(jax.ShapeDtypeStruct((), jnp.int32) for _ in self.axes[part][1:])
+        arguments: tuple[Any, ...] = (states, *rest)
+        if self.mesh is not None:
+            arguments = self.laid_out(part, arguments, described)
+        jitted.coming = begun(jitted.compile, *arguments)
+
+    def laid_out(self, part: str, arguments: tuple, lay: Callable[[Any, NamedSharding], Any]) -> tuple:
+        """A part's arguments on the mesh: those that all seeds share whole on every device, the others by seeds."""
+        assert self.mesh is not None
+        layouts = [sharding.shared(self.mesh) if a is None else sharding.over_seeds(self.mesh) for a in self.axes[part]]
+        return tuple(lay(*pair) for pair in zip(arguments, layouts, strict=True))
+
+    def __call__(self, part: str, *arguments: Any, purpose: str | None = None) -> Any:
+        """Run a part; its time is counted as that of `purpose`."""
+        interrupt.check()  # one that came while a library swallowed it
+        jitted, name = self.parts[part], purpose or part
+        if self.mesh is not None:
+            arguments = self.laid_out(part, arguments, placed)
+        began, compiled = time.monotonic(), jitted.seconds
+        if jitted.compiled is None:
+            with self.on_compile(part):
+                jitted.ready(*arguments)
+        result = jitted(*arguments)
+        compiling = jitted.seconds - compiled
+        self.spent[name] = self.spent.get(name, 0.0) + time.monotonic() - began - compiling
+        self.spent["compile"] = self.spent.get("compile", 0.0) + compiling
+        return result
+
+    def collect(self, keys: Any, params: Params, exploring: bool, purpose: str = "collect") -> list[Episode]:
+        """An episode of each seed's policy [S, ...], or of random controls."""
+        if self.drive is None:
+            ran: Trajectory = fetched(self("episode", keys, params, jnp.asarray(exploring), purpose=purpose))
+            alone = [trimmed(jax.tree.map(lambda leaf: leaf[i], ran)) for i in range(self.seeds)]  # noqa: B023
+            return [Episode(one, "horizon" if len(one.u) == self.horizon else "terminated") for one in alone]
+        began = time.monotonic()
+        found = [
+            self.drive(keys[i], jax.tree.map(lambda leaf: leaf[i], params), exploring)  # noqa: B023
+            for i in range(self.seeds)
+        ]
+        self.spent[purpose] = self.spent.get(purpose, 0.0) + time.monotonic() - began
+        return found
+
+    def evaluate(self, keys: Any, params: Any) -> np.ndarray:
+        """Costs [S, E, H] of episodes on a plant in JAX of the policies, one for each key [S, E]."""
+        follow = jnp.asarray(False)  # the policy, not random controls
+        if self.side_by_side:
+            return np.asarray(fetched(self("evaluate", keys, params, follow).cost))
+        several = (self("episode", some, params, follow, purpose="evaluate") for some in jnp.swapaxes(keys, 0, 1))
+        return np.stack([np.asarray(fetched(episode.cost)) for episode in several], axis=1)
+
+    def seconds(self) -> dict[str, float]:
+        """Seconds spent in each part since the last call."""
+        spent, self.spent = self.spent, {}
+        return {name: round(spent.get(name, 0.0), 3) for name in NAMES}
+
+
+def begun(function: Callable[..., Any], *arguments: Any) -> Future:
+    """The function's result to come. Another thread computes it, so that a signal always finds this one awake.
+
+    A thread that does not keep the process alive: who is asked to stop does not wait for the compiler.
+    """
+    coming: Future = Future()
+
+    def work() -> None:
+        try:
+            coming.set_result(function(*arguments))
+        except BaseException as error:
+            coming.set_exception(error)
+
+    Thread(target=work, daemon=True).start()
+    return coming
+
+
+def share_processors(seeds: int, particles: int | None = None) -> None:
+    """Where a CPU does the work, make a device of as many of its cores as share the seeds evenly, unless JAX was told.
+
+    One program for all seeds hardly uses a second core: a seed's matrices are too small to be shared. Where so few
+    `particles` are imagined at once, threads would cost more than they do: then there is one (docs/costs.md). To be
+    called before JAX has looked for devices.
+    """
+    asked = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
+    told = asked > 0 or "xla_force_host_platform" in os.environ.get("XLA_FLAGS", "")
+    if told:
+        return
+    jax.config.update("jax_num_cpu_devices", max(n for n in range(1, processors() + 1) if seeds % n == 0))
+    if particles is not None and seeds * particles <= FEW and not entry_points(group="jax_plugins"):  # no accelerator
+        os.environ.setdefault("NPROC", "1")  # what XLA asks for the number of its threads
+
+
+def compiler_options(by_platform: dict[str, dict[str, Any]]) -> dict[str, Any]:
+    """The compiler's options for the platform at hand: those that its version has, and XLA_FLAGS does not speak of."""
+    wanted, told = by_platform.get(jax.default_backend(), {}), os.environ.get("XLA_FLAGS", "")
+    return {name: value for name, value in wanted.items() if name not in told and _has(name, value)}
+
+
+@cache
+def _has(name: str, value: Any) -> bool:
+    try:
+        jax.jit(lambda: jnp.zeros(())).lower().compile(compiler_options={name: value})
+    except jax.errors.JaxRuntimeError:
+        return False
+    return True
+
+
+def over_seeds(
+    function: Callable[..., Any], axes: tuple[int | None, ...], *, seeds: int, over: Mesh | None = None
+) -> Callable[..., Any]:
+    """The function over a leading axis of `seeds`; one seed is the function itself, so that its numbers do not change.
+
+    `axes` is 0 for an argument with that axis, None for one that all seeds share. With a mesh the seeds are shared out.
+    """
+    if over is not None and over.shape[sharding.PARTICLES] == 1:
+        return sharding.each_its_own(over_seeds(function, axes, seeds=seeds // over.shape[sharding.SEEDS]), over, axes, 0)
+    if seeds > 1:
+        return jax.vmap(function, axes, spmd_axis_name=sharding.SEEDS)
+
+    def alone(*arguments: Any) -> Any:
+        own = (
+            argument if axis is None else jax.tree.map(lambda leaf: leaf[0], argument)
+            for argument, axis in zip(arguments, axes, strict=True)
+        )
+        return jax.tree.map(lambda leaf: leaf[None], function(*own))
+
+    return alone
+
+
+def placed(tree: Any, layout: NamedSharding) -> Any:
+    """The tree's arrays laid out over devices; arrays that other processes hold too are equal there."""
+
+    def put(leaf: Any) -> Any:
+        if isinstance(leaf, jax.Array) and leaf.sharding.is_equivalent_to(layout, leaf.ndim):
+            return leaf
+        if isinstance(leaf, jax.Array) and not leaf.is_fully_addressable:
+            return jax.device_put(leaf, layout)
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(put(np.asarray(jax.random.key_data(leaf))))
+        return jax.device_put(np.asarray(leaf), layout)
+
+    return jax.tree.map(put, tree)
+
+
+def described(tree: Any, layout: NamedSharding) -> Any:
+    """The shapes of a tree's arrays when they are laid out over devices."""
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=layout), tree)
+
+
+def fetched(tree: Any) -> Any:
+    """The tree's arrays whole on this process, whatever devices of whatever process hold them."""
+    if jax.process_count() == 1:
+        return tree
+
+    def get(leaf: Any) -> Any:
+        if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            return jax.random.wrap_key_data(get(jax.random.key_data(leaf)))
+        return jnp.asarray(multihost_utils.process_allgather(leaf, tiled=True))
+
+    return jax.tree.map(get, tree)
+
+
+def leads() -> bool:
+    """Whether this process is the one that writes files and speaks."""
+    return jax.process_index() == 0
+
+
+def chunk(steps: int) -> int:
+    """Search iterations between two looks at the clock: a divisor of `steps` near a tenth of it."""
+    return next(d for d in range(-(-steps // 20), steps + 1) if steps % d == 0)

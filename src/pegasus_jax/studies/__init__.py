@@ -1,0 +1,1 @@
+"""Experiments over many seeds: what the paper's figures and our tables are made of."""

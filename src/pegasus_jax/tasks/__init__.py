@@ -1,0 +1,292 @@
+"""Task names -> tasks. The only importer of pegasus_envs."""
+
+import dataclasses
+import os
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from pegasus_envs import mjcf, mjcf_check
+from pegasus_envs.cartpole import cartpole
+from pegasus_envs.double_cartpole import double_cartpole
+from pegasus_envs.gym_plant import EnvSpec, env_plant, env_spec, make_env, starts
+from pegasus_envs.gym_plant import close_environments as close_environments
+from pegasus_envs.plant import Plant
+from pegasus_envs.render import frames, unstack
+from pegasus_envs.swimmer import swimmer
+from pegasus_jax import interrupt
+from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.config import Config
+from pegasus_jax.defaults import GYM, MANOEUVRES, MJCF
+from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
+from pegasus_jax.tasks import user_code
+from pegasus_jax.types import Task
+
+
+def of_plant(name: str, plant: Plant) -> Task:
+    """The task a plant of pegasus_envs poses."""
+    return Task(
+        name=name,
+        plant=plant,
+        cost=saturating(plant.error, plant.width),
+        angles=plant.angles,
+        start_mean=plant.start_mean,
+        start_std=plant.start_std,
+        sensor_std=plant.sensor_std,
+        control_low=plant.control_low,
+        control_high=plant.control_high,
+        horizon=plant.horizon,
+        dt=plant.dt,
+        state_names=plant.state_names,
+        control_names=plant.control_names,
+        rates=plant.rates,
+        expected_cost=expected_saturating(plant.error, plant.width, plant.angles),
+        widened=partial(widened, plant.error, plant.width, plant.angles),
+    )
+
+
+# Name -> the plant, given how many of its legs a swimmer drives.
+TASKS: dict[str, Callable[[Any], Plant]] = {
+    "cartpole": lambda legs: cartpole(),
+    "double_cartpole": lambda legs: double_cartpole(),
+    **{f"swimmer_{manoeuvre}": partial(swimmer, manoeuvre) for manoeuvre in MANOEUVRES},
+}
+
+
+def make(name: str, legs: int = 2) -> Task:
+    """The task of that name; only the swimmer has legs. Raises SettingError for an unknown one."""
+    if name not in TASKS:
+        raise SettingError(f"task={name} is unknown; {nearest(name, TASKS)}")
+    return of_plant(name, TASKS[name](legs))
+
+
+def of_config(config: Config) -> Task:
+    """The task that a config names."""
+    own = {GYM: of_gym, MJCF: of_mjcf}
+    return own[config.task](config) if config.task in own else make(config.task, config.legs)
+
+
+def rates_of(task: Task) -> tuple[int, ...]:
+    """The entries of a task's state that are rates of the others. Raises SettingError where they are not known."""
+    states = len(task.state_names)
+    if 2 * len(set(task.rates)) != states or set(task.rates) & set(task.angles):
+        raise SettingError(
+            f"model=lagrangian needs a state of coordinates and their rates, and that of task={task.name} is not known"
+            " to be one; the nearest is model=log_normal"
+        )
+    return task.rates
+
+
+def known_sensors(task: Task) -> np.ndarray:
+    """The std [D] of a task's sensors. Raises SettingError where it is not known."""
+    if not np.any(task.sensor_std):
+        raise SettingError(
+            f"search.sensors=known needs a plant whose sensors' noise is known, and that of task={task.name} is not;"
+            " the nearest is search.sensors=predicted"
+        )
+    return np.asarray(task.sensor_std, float)
+
+
+def input_scale(task: Task, units: tuple[float, ...]) -> Any:
+    """What a policy's features [F] are multiplied by, so that it counts in these units; 1 for none.
+
+    Raises SettingError where they are not one for each state that is no angle.
+    """
+    names = [name for i, name in enumerate(task.state_names) if i not in task.angles]
+    if units and len(units) != len(names):
+        raise SettingError(f"policy.input_units={list(units)} must be {len(names)} numbers, of {', '.join(names)}")
+    return np.concatenate([1 / np.array(units), np.ones(2 * len(task.angles))]) if units else 1.0
+
+
+def pinned(config: Config) -> Config:
+    """The config for a run's folder: it finds its MJCF file from anywhere.
+
+    That of a Gymnasium environment says all that has to be known of it, so that whoever reads the folder, or goes on
+    with it, neither opens nor resets it: it may be a robot.
+    """
+    if config.task == GYM:
+        _complete(config)
+        environment(config)
+        given = {name: getattr(config, name) for name in EnvSpec._fields}
+        try:
+            known = env_spec(config.env or "", config.env_args, **given)
+        except ValueError as error:
+            raise SettingError(f"env={config.env}: {' '.join(str(error).split())}") from error
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:
+            raise SettingError(f"env={config.env}: {user_code.told(error)}") from error
+        plain = {
+            name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known._asdict().items()
+        }
+        return dataclasses.replace(config, **plain)
+    if config.task != MJCF or config.mjcf is None:
+        return config
+    return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf))
+
+
+def of_gym(config: Config) -> Task:
+    """The task that a Gymnasium environment and a cost of its observations pose. Raises SettingError if they cannot."""
+    _complete(config)
+    known: dict[str, Any] = {name: getattr(config, name) for name in EnvSpec._fields}
+    if any(value in (None, ()) for value in known.values()):
+        return of_gym(pinned(config))
+    known |= {name: np.array(value, float) for name, value in known.items() if isinstance(value, tuple)}
+    name, about = config.env or "", EnvSpec(**known)
+    states = tuple(f"x{i}" for i in range(len(about.start_mean)))
+    controls = tuple(f"u{i}" for i in range(len(about.control_low)))
+    task = _of_users(config, name, None, about, about.horizon, states, controls)
+    return task._replace(
+        rates=_entries("rates", config.rates, name, len(states)),
+        environment=env_plant(name, config.env_args, len(states)),
+    )
+
+
+def close(task: Task) -> None:
+    """Close the task's environment, if it has one and it is open."""
+    if task.environment is not None:
+        interrupt.let_go(task.environment.close)
+
+
+def _complete(config: Config) -> None:
+    """Raises SettingError unless an environment is named, and a cost that there is: no robot is opened in vain."""
+    if config.env is None or config.cost is None:
+        raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
+    user_code.load("cost", config.cost)
+    module, colon, _ = config.env.partition(":")
+    if colon:  # Gymnasium imports it, to register what is in it
+        user_code.importing(f"env={config.env}", module)
+
+
+def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarray]:
+    """The least and the greatest observation [D] as far as its environment tells them, else infinite."""
+    if config.task == GYM:
+        space: Any = environment(config).observation_space
+        return np.asarray(space.low, float), np.asarray(space.high, float)
+    return np.full(len(task.state_names), -np.inf), np.full(len(task.state_names), np.inf)
+
+
+def readings(config: Config, task: Task, resets: int) -> np.ndarray:
+    """What an environment observes after so many resets [N, D]; N is 0 for a simulation of our own.
+
+    Raises SettingError, in one line, for what the environment raises.
+    """
+    if config.task != GYM:
+        return np.zeros((0, len(task.state_names)))
+    with user_code.blamed(f"env={config.env} cannot be reset"):
+        return starts(config.env or "", config.env_args, resets)
+
+
+def compared(config: Config, task: Task) -> None:
+    """Raises SettingError, in one line, where MJX does not simulate a task's MJCF file as MuJoCo does."""
+    if config.task == MJCF:
+        try:
+            mjcf_check.compare(task.plant)
+        except ValueError as error:
+            raise SettingError(f"mjcf={config.mjcf}: {error}") from error
+
+
+def described(config: Config) -> dict[str, str]:
+    """What an environment says of itself, by name."""
+    if config.task != GYM:
+        return {"model": config.mjcf} if config.mjcf else {}
+    env: Any = environment(config)
+    layers = [env]
+    while hasattr(layers[-1], "env"):
+        layers.append(layers[-1].env)
+    spaces = {"observes": env.observation_space, "is driven by": env.action_space}
+    return {
+        "environment": " of ".join(type(layer).__name__ for layer in layers),
+        **{k: str(v) for k, v in spaces.items()},
+    }
+
+
+def environment(config: Config) -> Any:
+    """The environment of a config, opened once a process. Raises SettingError, in one line, where it cannot be made."""
+    name, _, _ = (config.env or "").rpartition(":")
+    if name:
+        user_code.importing(f"env={config.env}", name)
+    try:
+        return make_env(config.env or "", config.env_args)
+    except (gymnasium.error.Error, ModuleNotFoundError) as error:
+        raise SettingError(f"env={config.env}: {str(error).splitlines()[0]}") from error
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # sys.exit is one
+        given = "; env_args.NAME=VALUE gives arguments" if isinstance(error, TypeError) else ""
+        raise SettingError(f"env={config.env} cannot be made: {user_code.told(error)}{given}") from error
+    finally:
+        interrupt.reclaim()
+
+
+def of_mjcf(config: Config) -> Task:
+    """The task that an MJCF file and a cost of its observations pose. Raises SettingError if they cannot."""
+    if None in (config.mjcf, config.cost, config.dt, config.horizon):
+        raise SettingError(
+            "task=mjcf needs mjcf=, cost=, dt= and horizon=; for example "
+            "mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40"
+        )
+    model = _model(config)
+    names = ("observe", "control_low", "control_high", "start_mean", "start_std")
+    try:
+        plant = mjcf.mechanism(model, config.dt or 0.0, **{name: getattr(config, name) for name in names})
+    except ValueError as error:
+        raise SettingError(f"mjcf={config.mjcf}: {error}") from error
+    name = Path(config.mjcf or "").stem
+    task = _of_users(config, name, plant, plant, config.horizon or 0, plant.state_names, plant.control_names)
+    return task._replace(rates=plant.rates)
+
+
+def mjcf_digest(task: Task) -> str | None:
+    """SHA-256 of the compiled model of a task=mjcf, whatever files it was made of; None of another task."""
+    return mjcf.digest(task.plant.model) if isinstance(task.plant, mjcf.Mechanism) else None
+
+
+def _model(config: Config) -> Any:
+    try:
+        return mjcf.read(Path(config.mjcf or ""))
+    except ValueError as error:
+        raise SettingError(f"mjcf={config.mjcf}: {error}") from error
+
+
+def _of_users(
+    config: Config, name: str, plant: Any, about: Any, horizon: int, states: tuple[str, ...], controls: tuple[str, ...]
+) -> Task:
+    """The task that a user's plant, about which `about` is known, poses with the config's cost and angles."""
+    return Task(
+        name=name,
+        plant=plant,
+        cost=user_code.load("cost", config.cost or ""),
+        angles=_entries("angles", config.angles, name, len(states)),
+        start_mean=about.start_mean,
+        start_std=about.start_std,
+        sensor_std=np.zeros(len(states)),
+        control_low=about.control_low,
+        control_high=about.control_high,
+        horizon=horizon,
+        dt=about.dt,
+        state_names=states,
+        control_names=controls,
+        success=config.success,
+        stop=None if config.stop is None else user_code.load("stop", config.stop),
+        stop_cost=config.stop_cost,
+    )
+
+
+def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> tuple[int, ...]:
+    """The entries, if they are ones of the observation."""
+    for entry in entries:
+        if not 0 <= entry < states:
+            raise SettingError(
+                f"{setting}={entry} is not an entry of {name}'s observation; choose from 0 to {states - 1}"
+            )
+    return entries
+
+
+def pictures(task: Task, states: Any, width: int, height: int) -> list[np.ndarray]:
+    """Pictures [height, width, 3] of stacked states [N, ...] of the task's plant."""
+    return frames(task.plant, unstack(states), width, height)

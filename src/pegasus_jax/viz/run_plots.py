@@ -1,0 +1,98 @@
+"""Pictures of a run: its learning curve, and each trial's imagined trajectories against what the plant then did."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+from pegasus_jax.checks import RunError
+from pegasus_jax.runs.files import write_whole
+from pegasus_jax.runs.store import load_episode, load_imagined, trials
+from pegasus_jax.types import Task
+
+REAL, IMAGINED = "#d1495b", "#30638e"
+
+
+def run_pictures(run: Path, task: Task) -> list[Path]:
+    """Draw RUN/plots/learning.png and RUN/plots/trial_NNNN.png for every trial that has been imagined."""
+    rows = trials(run)
+    if not rows:
+        raise RunError(f"{run / 'trials.jsonl'} holds no finished trial yet")
+    folder = run / "plots"
+    if folder.is_symlink():  # what it points to may be anybody's
+        folder.unlink()
+    paths = [folder / "learning.png"]
+    learning(rows, paths[0])
+    for row in rows:
+        fan = load_imagined(run, row["trial"])
+        if fan is not None:
+            paths.append(folder / f"trial_{row['trial']:04d}.png")
+            trajectories(run, row["trial"], fan, task, paths[-1])
+    return paths
+
+
+def learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Cost and success against seconds of plant time, raw: no smoothing, no best so far.
+
+    Of a run that is not evaluated, the cost of each trial's own episode, by the policy of the trial before.
+    """
+    measured = any(row["mean_cost"] is not None for row in rows)
+    cost, label = ("mean_cost", "mean of evaluation episodes") if measured else ("episode_cost", "the trial's episode")
+    seconds = [row["plant_seconds"] for row in rows]
+    figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(7, 5.5), height_ratios=(2, 1))
+    top.plot(seconds, [row[cost] for row in rows], "o-", color=REAL, label=f"plant, {label}")
+    top.plot(seconds, [row["objective_last"] for row in rows], ".--", color=IMAGINED, label="imagined, held scenarios")
+    top.plot(seconds, [row["objective_fresh"] for row in rows], ".:", color=IMAGINED, label="imagined, fresh scenarios")
+    top.set(ylabel="mean cost a step", ylim=(0, 1.02))
+    top.legend(frameon=False)
+    bottom.plot(seconds, [row["success_rate"] for row in rows], "o-", color=REAL)
+    if not measured:
+        bottom.text(0.5, 0.5, "not measured: evaluation=0", transform=bottom.transAxes, ha="center", va="center")
+    bottom.set(ylabel="success rate", xlabel="plant time [s]", ylim=(-0.03, 1.03))
+    for axis in (top, bottom):
+        axis.grid(alpha=0.25)
+    _save(figure, path)
+
+
+def trajectories(run: Path, trial: int, fan: dict[str, np.ndarray], task: Task, path: Path) -> None:
+    """The fan of particles after a trial, and over it the next episode on the plant, if it has been run."""
+    real = load_episode(run, trial + 1)
+    names = [*task.state_names, *task.control_names, "cost"]
+    columns = 3
+    figure, axes = plt.subplots(-(-len(names) // columns), columns, figsize=(11, 2.4 * -(-len(names) // columns)))
+    flat: list[Axes] = list(np.ravel(axes))
+    imagined = [*np.moveaxis(fan["x"], -1, 0), *np.moveaxis(fan["u"], -1, 0), fan["cost"]]
+    actual = None if real is None else [*real.trajectory.x.T, *real.trajectory.u.T, real.trajectory.cost]
+    for i, (axis, name) in enumerate(zip(flat, names, strict=False)):
+        first = 1 if name == "cost" else 0
+        _fan(axis, (first + np.arange(imagined[i].shape[0])) * task.dt, imagined[i])
+        if actual is not None:
+            axis.plot((first + np.arange(len(actual[i]))) * task.dt, actual[i], color=REAL, lw=1.6)
+        axis.set_title(name, fontsize=9)
+        axis.grid(alpha=0.25)
+    for axis in flat[len(names) :]:
+        axis.axis("off")
+    told = "the plant's next episode in red" if actual is not None else "the plant has not run this policy yet"
+    figure.suptitle(f"after trial {trial}: imagined particles in blue, {told}", fontsize=10)
+    _save(figure, path)
+
+
+def _fan(axis: Axes, time: np.ndarray, values: np.ndarray) -> None:
+    """Every particle thin, the middle 50 and 90 % shaded; values [H, K]."""
+    axis.plot(time, values[:, :40], color=IMAGINED, lw=0.4, alpha=0.25)
+    for low, high, alpha in ((5, 95, 0.15), (25, 75, 0.25)):
+        bounds = np.percentile(values, (low, high), axis=1)
+        axis.fill_between(time, *bounds, color=IMAGINED, alpha=alpha, lw=0)
+
+
+def _save(figure: Any, path: Path) -> None:
+    figure.tight_layout()
+    write_whole(path, lambda file: figure.savefig(file, format="png", dpi=110))
+    plt.close(figure)

@@ -1,0 +1,131 @@
+"""A film of a run's newest policy on its plant, with cost and command drawn below as they come about."""
+
+import os
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, NamedTuple
+
+import imageio.v2 as imageio
+import jax
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from pegasus_jax import episode, tasks
+from pegasus_jax.checks import RunError
+from pegasus_jax.runs import restore
+from pegasus_jax.types import Array, Key, Params, Policy, Task, Trajectory
+
+WIDTH, HEIGHT, STRIP = 640, 480, 192  # [pixels], multiples of the 16 of a video's blocks
+COST, CURSOR = "#d1495b", np.array([40, 40, 40], np.uint8)
+os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")  # else it forks by hand, which JAX's threads forbid
+
+COMING = 0.15  # how much is seen of what is yet to come
+
+
+class Strip(NamedTuple):
+    """Cost and command of one episode against time, as a picture."""
+
+    picture: np.ndarray  # [STRIP, WIDTH, 3] 8-bit colours
+    left: int  # column of the episode's first moment [pixels]
+    right: int  # column of its last
+    top: int  # first row of the axes [pixels]
+    bottom: int  # last row of the axes
+
+
+def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.LAST, mjcf: str | None = None) -> Path:
+    """Write RUN/play.mp4: `episodes` episodes that are not data, one after the other, in real time."""
+    config, experiment, state = restore.ready(run, trial, mjcf)
+    task, mean = experiment.task, config.policy.execution == "mean"
+    if not hasattr(task.plant, "glide"):
+        raise RunError(f"{run} learned {task.name}; only plants in JAX can be filmed")
+    perform = jax.jit(partial(performance, task=task, policy=experiment.policy, mean=mean))
+    path, writer = run / "play.mp4", None
+    # A folder of its own beside: ffmpeg opens no file that was there, and what was at `path`, a link too, is replaced.
+    with TemporaryDirectory(dir=run, prefix=".play.") as folder:
+        beside = Path(folder) / path.name
+        try:
+            for number, key in enumerate(jax.random.split(jax.random.key(seed), episodes), start=1):
+                trajectory, states = perform(key, state.policy.params)
+                title = f"{task.name}, trial {int(state.trial)}, episode {number} of {episodes}"
+                drawn = pictures(task, states)
+                if writer is None:
+                    writer = _writer(beside, rate=round(len(drawn) / (task.horizon * task.dt)))
+                for picture in composed(drawn, strip(trajectory, task, title)):
+                    writer.append_data(picture)
+        finally:
+            if writer is not None:
+                writer.close()
+        os.replace(beside, path)
+    return path
+
+
+def performance(key: Key, params: Params, *, task: Task, policy: Policy, mean: bool) -> tuple[Trajectory, Any]:
+    """One episode of a policy, and the plant's states on the way [H, n, ...], n a control period."""
+
+    def act(key: Key, t: Array, x: Array) -> Array:
+        return policy.apply(params, None if mean else policy.sample(key), x)
+
+    return episode.watch(key, act, task, task.plant.glide)
+
+
+def strip(trajectory: Trajectory, task: Task, title: str) -> Strip:
+    """Draw an episode's cost and command; a control is held for its period, at whose end the cost is counted."""
+    times = task.dt * np.arange(task.horizon + 1)
+    cost, u = np.asarray(trajectory.cost), np.asarray(trajectory.u)
+    low, high = np.asarray(task.control_low), np.asarray(task.control_high)
+    units = {name.rpartition(" ")[2] for name in task.control_names}
+    figure, (above, below) = plt.subplots(2, 1, sharex=True, figsize=(WIDTH / 100, STRIP / 100), dpi=100)
+    figure.subplots_adjust(left=0.11, right=0.97, top=0.87, bottom=0.2, hspace=0.2)
+    above.plot(times[1:], cost, color=COST, linewidth=1.5)
+    above.set(ylim=(-0.05, 1.05), xlim=(0, times[-1]))
+    above.set_title(f"{title}: mean cost {cost.mean():.3f}", fontsize=8)
+    below.step(times, np.concatenate([u, u[-1:]]), where="post", linewidth=1.0)
+    margin = 0.05 * (high.max() - low.min())
+    below.set_ylim(low.min() - margin, high.max() + margin)
+    below.set_xlabel("time [s]", fontsize=7, labelpad=1)
+    above.set_ylabel("cost", fontsize=7)
+    below.set_ylabel(f"command {units.pop()}" if len(units) == 1 else "command", fontsize=7)
+    for axis in (above, below):
+        axis.tick_params(labelsize=7)
+        axis.grid(alpha=0.25)
+    figure.align_ylabels()
+    canvas: Any = figure.canvas
+    canvas.draw()
+    picture = np.asarray(canvas.buffer_rgba())[..., :3].copy()
+    (left, right), (top, bottom) = above.bbox.intervalx, (above.bbox.y1, below.bbox.y0)
+    plt.close(figure)
+    return Strip(picture, round(left), round(right), STRIP - round(top), STRIP - round(bottom))
+
+
+def composed(pictures: list[np.ndarray], drawn: Strip) -> list[np.ndarray]:
+    """Each picture above its strip, in which what is yet to come is faint and a line marks the moment."""
+    faint = (255 - COMING * (255.0 - drawn.picture)).astype(np.uint8)
+    rows, whole = slice(drawn.top, drawn.bottom), []
+    for number, picture in enumerate(pictures, start=1):
+        now = drawn.left + round((drawn.right - drawn.left) * number / len(pictures))
+        below = drawn.picture.copy()
+        below[rows, now : drawn.right + 1] = faint[rows, now : drawn.right + 1]
+        below[rows, now - 1 : now + 1] = CURSOR
+        whole.append(np.concatenate([picture, below]))
+    return whole
+
+
+def pictures(task: Task, states: Any, width: int = WIDTH, height: int = HEIGHT) -> list[np.ndarray]:
+    """Pictures [height, width, 3] of states [H, n, ...]. Raises RunError where nothing can be drawn."""
+
+    def flat(leaf: Any) -> np.ndarray:  # sizes are named, because -1 means nothing for a leaf without entries
+        return np.asarray(leaf).reshape(leaf.shape[0] * leaf.shape[1], *leaf.shape[2:])
+
+    try:
+        return tasks.pictures(task, jax.tree.map(flat, states), width, height)
+    except RuntimeError as error:
+        raise RunError(str(error).splitlines()[0]) from error
+
+
+def _writer(path: Path, rate: int) -> Any:
+    return imageio.get_writer(path, fps=rate, macro_block_size=16)
