@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 
 from pegasus_envs.plant import Plant
-from pegasus_envs.swimmer import Swimming
+from pegasus_envs.swimmer.plant import Swimming
 
 ROLL = {"knife_edge": np.pi / 2, "belly_up": np.pi, "depth_change": 0.0, "corkscrew": None}
 NAMES = ("thrust", "roll", "roll_rate", "pitch", "pitch_rate", "yaw", "yaw_rate", "depth", "steady", "lead", "heave")

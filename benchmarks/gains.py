@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.feedback import NAMES, ROLL, episodes
-from pegasus_envs.swimmer import swimmer
+from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax.runs import config_io
 
 CANDIDATES, ELITE, STARTS = 32, 8, 2

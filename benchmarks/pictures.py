@@ -24,10 +24,10 @@ import numpy as np
 from benchmarks.study import RESULTS
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
-from pegasus_envs.goals import Task
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames
-from pegasus_envs.swimmer import swimmer
+from pegasus_envs.swimmer.goals import Task
+from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.restore import ready
 

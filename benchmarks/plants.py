@@ -22,12 +22,12 @@ from mujoco import rollout
 
 from benchmarks.in_c import Drive, held, in_c, stroke
 from benchmarks.study import RESULTS
-from pegasus_envs.attitude import angles_of
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.physics import Motion
 from pegasus_envs.plant import Plant, simulate
-from pegasus_envs.swimmer import HIPS, swimmer
+from pegasus_envs.swimmer.plant import HIPS, swimmer
+from pegasus_envs.swimmer.rotations import angles_of
 from pegasus_jax.runs.machine import about, processors
 
 SECONDS, SEEDS, TIMES = 20.0, 8, (0.5, 1, 2, 3, 5, 10, 20)

@@ -17,7 +17,7 @@ import numpy as np
 
 from benchmarks.feedback import GAINS, ROLL, episodes
 from benchmarks.study import RESULTS
-from pegasus_envs.swimmer import swimmer
+from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
 

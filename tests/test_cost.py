@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
-from pegasus_envs.swimmer import swimmer
+from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax import tasks
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.math.angles import encode

@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from pegasus_envs import mjcf, mjcf_check
+from pegasus_envs import mjcf_check, mjcf_plant
 from pegasus_envs.render import frames
 from pegasus_jax import tasks
 from pegasus_jax.checks import SettingError
@@ -30,21 +30,21 @@ MOTOR = '<motor joint="elbow" ctrllimited="true" ctrlrange="-1 1"/>'
 
 
 @pytest.fixture(scope="module")
-def pendulum() -> mjcf.Mechanism:
-    return mjcf.mechanism(mjcf.read(PENDULUM), 0.04, start_std=[0.05])
+def pendulum() -> mjcf_plant.Mechanism:
+    return mjcf_plant.mechanism(mjcf_plant.read(PENDULUM), 0.04, start_std=[0.05])
 
 
 def config(path: Path | str = PENDULUM, **changes: object) -> Config:
     return Config(**({"task": "mjcf", "mjcf": str(path), "cost": "math:sin", "dt": 0.04, "horizon": 8} | changes))  # type: ignore[arg-type]
 
 
-def test_follows_c_through_limits_and_is_pure(pendulum: mjcf.Mechanism) -> None:
+def test_follows_c_through_limits_and_is_pure(pendulum: mjcf_plant.Mechanism) -> None:
     """Two episodes at once, each against C MuJoCo: the cart hits the ends of its rail, which are constraints."""
     controls = np.random.default_rng(0).uniform(-3, 3, (2, 50, 1)).astype(np.float32)
     controls[1] = 3.0
 
-    def run(state: mjcf.Moving, controls: jax.Array) -> jax.Array:
-        def step(state: mjcf.Moving, control: jax.Array) -> tuple[mjcf.Moving, jax.Array]:
+    def run(state: mjcf_plant.Moving, controls: jax.Array) -> jax.Array:
+        def step(state: mjcf_plant.Moving, control: jax.Array) -> tuple[mjcf_plant.Moving, jax.Array]:
             state = pendulum.step(state, control)
             return state, pendulum.observe(state)
 
@@ -65,8 +65,10 @@ def test_follows_c_through_limits_and_is_pure(pendulum: mjcf.Mechanism) -> None:
     assert not np.allclose(xs[0], xs[1])
 
 
-def test_what_is_observed_is_placed(pendulum: mjcf.Mechanism) -> None:
-    some = mjcf.mechanism(pendulum.model, 0.04, observe=["qvel.1", "qpos.1"], start_mean=[1.0, 0.2], start_std=[0.0])
+def test_what_is_observed_is_placed(pendulum: mjcf_plant.Mechanism) -> None:
+    some = mjcf_plant.mechanism(
+        pendulum.model, 0.04, observe=["qvel.1", "qpos.1"], start_mean=[1.0, 0.2], start_std=[0.0]
+    )
     state = some.reset(jax.random.key(0))
     np.testing.assert_allclose(some.observe(state), [1.0, 0.2])
     np.testing.assert_allclose((state.qpos, state.qvel), ([0, 0.2], [0, 1.0]))
@@ -74,12 +76,12 @@ def test_what_is_observed_is_placed(pendulum: mjcf.Mechanism) -> None:
     assert pendulum.state_names == ("slider [m]", "hinge [rad]", "slider' [m/s]", "hinge' [rad/s]")
     np.testing.assert_allclose((some.control_low, some.control_high), ([-3.0], [3.0]))
     assert (pendulum.rates, some.rates) == ((2, 3), (0,))
-    assert mjcf.mechanism(pendulum.model, 0.04, observe=["qpos.0", "qpos.1", "qvel.1"]).rates == ()
-    narrow = mjcf.mechanism(pendulum.model, 0.04, control_low=[-1.0], control_high=[0.5])
+    assert mjcf_plant.mechanism(pendulum.model, 0.04, observe=["qpos.0", "qpos.1", "qvel.1"]).rates == ()
+    narrow = mjcf_plant.mechanism(pendulum.model, 0.04, control_low=[-1.0], control_high=[0.5])
     np.testing.assert_allclose((narrow.control_low, narrow.control_high), ([-1.0], [0.5]))
 
 
-def test_is_drawn_without_a_camera_of_its_own(pendulum: mjcf.Mechanism) -> None:
+def test_is_drawn_without_a_camera_of_its_own(pendulum: mjcf_plant.Mechanism) -> None:
     one, two = frames(pendulum, [pendulum.place(jnp.array([0.0, a, 0.0, 0.0])) for a in (0.0, 0.5)], 160, 120)
     assert np.abs(one.astype(int) - two).max() > 50
 
@@ -182,10 +184,10 @@ def test_files_that_cannot_be_are_one_line(parts: dict[str, str], message: str, 
     assert "\n" not in str(caught.value)
 
 
-def arm(path: Path, **parts: str) -> mjcf.Mechanism:
+def arm(path: Path, **parts: str) -> mjcf_plant.Mechanism:
     """The arm of a file with these parts, whatever MJX ignores of it."""
     path.write_text(ARM.format(**{"density": "1000", "geom": "", "motor": MOTOR} | parts))
-    return mjcf.mechanism(mujoco.MjModel.from_xml_path(str(path)), 0.02, start_std=[0.1])
+    return mjcf_plant.mechanism(mujoco.MjModel.from_xml_path(str(path)), 0.02, start_std=[0.1])
 
 
 def test_flags_that_change_nothing_are_cleared(tmp_path: Path) -> None:
@@ -195,10 +197,10 @@ def test_flags_that_change_nothing_are_cleared(tmp_path: Path) -> None:
             density='1000"><flag energy="enable" fwdinv="enable"/></option><option density="1000', geom="", motor=MOTOR
         )
     )
-    assert mjcf.read(path).opt.enableflags == 0
+    assert mjcf_plant.read(path).opt.enableflags == 0
 
 
-def test_what_mjx_simulates_as_mujoco_does_is_let_through(pendulum: mjcf.Mechanism, tmp_path: Path) -> None:
+def test_what_mjx_simulates_as_mujoco_does_is_let_through(pendulum: mjcf_plant.Mechanism, tmp_path: Path) -> None:
     mjcf_check.compare(pendulum)
     mjcf_check.compare(arm(tmp_path / "arm.xml"))
 
@@ -218,7 +220,7 @@ def test_what_mjx_simulates_as_mujoco_does_is_let_through(pendulum: mjcf.Mechani
 def test_another_physics_is_seen_by_comparing(parts: dict[str, str], tmp_path: Path) -> None:
     """Also without knowing what it is that MJX ignores."""
     made = arm(tmp_path / "arm.xml", **parts)
-    assert mjcf.ignored(made.model)
+    assert mjcf_plant.ignored(made.model)
     with pytest.raises(ValueError, match=r"does not simulate it as MuJoCo does: elbow.* differs in \d+ of 20"):
         mjcf_check.compare(made)
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 import pytest
 
-from pegasus_envs import mjcf
+from pegasus_envs import mjcf_plant
 from pegasus_jax.builder import build
 from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import make
@@ -57,7 +57,7 @@ def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
     words = {"task": name, "policy.hidden": "[8]"}
     if name in MOTORS:
         (tmp_path / "arm.xml").write_text(ARM.format(motor=MOTORS[name]))
-        assert mjcf.read(tmp_path / "arm.xml").na == (name == "arm_with_state")
+        assert mjcf_plant.read(tmp_path / "arm.xml").na == (name == "arm_with_state")
         plant = {"mjcf": str(tmp_path / "arm.xml"), "cost": "jax.numpy:sum", "dt": ".04", "horizon": "2"}
         words |= {"task": "mjcf", **plant}
     experiment = build(config_io.parse(words))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from pegasus_envs import mjcf
+from pegasus_envs import mjcf_plant
 
 PERIODS = 20  # of one random episode
 # Of an entry's change in a control period. Most of Gymnasium's files stay within 1e-5 in single precision; drag of
@@ -18,7 +18,7 @@ MOST = 0.8  # of the periods: contacts alone made 3 in 10 differ, of an ant
 SMALL = 1e-2  # a change that is less is not judged: there the solvers' own tolerances are
 
 
-def compare(made: mjcf.Mechanism, periods: int = PERIODS, seed: int = 0) -> None:
+def compare(made: mjcf_plant.Mechanism, periods: int = PERIODS, seed: int = 0) -> None:
     """Raises ValueError, in one line, where MJX's physics of a mechanism is not that of C MuJoCo, or not finite.
 
     Each control period of one episode of random controls is done twice from C MuJoCo's state, so that chaos has no time
@@ -33,7 +33,7 @@ def compare(made: mjcf.Mechanism, periods: int = PERIODS, seed: int = 0) -> None
     mujoco.set_mju_user_warning(lambda text: None)  # else it is on stderr, and in a file in the working folder
     for period in range(periods):
         now = (data.qpos, data.qvel, data.act, data.qacc_warmstart, data.time)
-        state = mjcf.Moving(*(jnp.array(part, first.qpos.dtype) for part in now))
+        state = mjcf_plant.Moving(*(jnp.array(part, first.qpos.dtype) for part in now))
         before, control = np.concatenate([data.qpos, data.qvel]), draws.uniform(made.control_low, made.control_high)
         data.ctrl[:] = control
         mujoco.mj_step(made.model, data, count)
@@ -49,7 +49,7 @@ def compare(made: mjcf.Mechanism, periods: int = PERIODS, seed: int = 0) -> None
     greatest = np.maximum(np.max(change, axis=0), SMALL)
     differs = np.max(np.array(off) / greatest, axis=1) > TOLERANCE
     if differs.mean() > MOST:
-        worst = mjcf.full_state_names(made.model)[int(np.argmax(np.median(np.array(off) / greatest, axis=0)))]
+        worst = mjcf_plant.full_state_names(made.model)[int(np.argmax(np.median(np.array(off) / greatest, axis=0)))]
         raise ValueError(
             f"MJX does not simulate it as MuJoCo does: {worst} differs in {differs.sum()} of {periods} control periods;"
             " leave out what MJX does not know"

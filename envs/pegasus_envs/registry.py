@@ -13,7 +13,7 @@ CONSTRUCTORS: dict[str, tuple[str, dict[str, Any]]] = {
     "pegasus/CartPoleSwingUp-v0": ("pegasus_envs.cartpole:cartpole", {}),
     "pegasus/DoubleCartPole-v0": ("pegasus_envs.double_cartpole:double_cartpole", {}),
     **{
-        f"pegasus/Swimmer{legs}{name}-v0": ("pegasus_envs.swimmer:swimmer", {"task": task, "legs": legs})
+        f"pegasus/Swimmer{legs}{name}-v0": ("pegasus_envs.swimmer.plant:swimmer", {"task": task, "legs": legs})
         for legs in (2, 6)
         for name, task in _TASKS.items()
     },
@@ -31,7 +31,7 @@ def register() -> None:
         if name not in registration.registry:
             registration.register(
                 name,
-                entry_point="pegasus_envs.gym:PlantEnv",
+                entry_point="pegasus_envs.gym_env:PlantEnv",
                 kwargs={"plant": constructor, "arguments": arguments},
                 # The plant's own horizon truncates; Gymnasium's wrapper would count a second time.
                 max_episode_steps=None,

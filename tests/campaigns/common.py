@@ -70,7 +70,7 @@ def load() -> None:
     import orbax.checkpoint  # noqa: F401
     import tensorboardX  # noqa: F401
 
-    import pegasus_envs.gym  # noqa: F401
+    import pegasus_envs.gym_env  # noqa: F401
 
     threads = len(os.listdir("/proc/self/task"))
     assert threads == 1, f"{threads} threads: a forked child would wait for those it does not have"

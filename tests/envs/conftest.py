@@ -7,7 +7,7 @@ import pytest
 from envs.references import Simulated, simulated
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
-from pegasus_envs.swimmer import swimmer
+from pegasus_envs.swimmer.plant import swimmer
 
 
 @cache

@@ -7,9 +7,9 @@ import mujoco
 import numpy as np
 
 from pegasus_envs import physics
-from pegasus_envs.flippers import acceleration
-from pegasus_envs.mechanism import mechanism
-from pegasus_envs.swimmer import swimmer
+from pegasus_envs.swimmer.dynamics import acceleration
+from pegasus_envs.swimmer.layout import mechanism
+from pegasus_envs.swimmer.plant import swimmer
 
 
 def in_c(model: mujoco.MjModel, qpos: np.ndarray, qvel: np.ndarray, command: np.ndarray) -> np.ndarray:

@@ -13,7 +13,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from pegasus_envs import IDS
-from pegasus_envs.gym import PlantEnv
+from pegasus_envs.gym_env import PlantEnv
 from pegasus_envs.plant import FRAME, saturating
 from pegasus_envs.render import Renderer, frames, unstack
 

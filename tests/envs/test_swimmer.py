@@ -7,9 +7,9 @@ import pytest
 
 from benchmarks.feedback import GAINS, episodes
 from benchmarks.in_c import in_c, stroke
-from pegasus_envs.attitude import angles_of, quaternion_of
 from pegasus_envs.plant import saturating, simulate
-from pegasus_envs.swimmer import HIPS, LAG, hip_angles, swimmer
+from pegasus_envs.swimmer.plant import HIPS, LAG, hip_angles, swimmer
+from pegasus_envs.swimmer.rotations import angles_of, quaternion_of
 
 STEP = 0.01
 

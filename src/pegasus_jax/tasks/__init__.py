@@ -10,14 +10,14 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from pegasus_envs import mjcf, mjcf_check
+from pegasus_envs import mjcf_check, mjcf_plant
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.gym_plant import EnvSpec, env_plant, env_spec, make_env, starts
 from pegasus_envs.gym_plant import close_environments as close_environments
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames, unstack
-from pegasus_envs.swimmer import swimmer
+from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax import interrupt
 from pegasus_jax.checks import SettingError, nearest
 from pegasus_jax.config import Config
@@ -233,7 +233,7 @@ def of_mjcf(config: Config) -> Task:
     model = _model(config)
     names = ("observe", "control_low", "control_high", "start_mean", "start_std")
     try:
-        plant = mjcf.mechanism(model, config.dt or 0.0, **{name: getattr(config, name) for name in names})
+        plant = mjcf_plant.mechanism(model, config.dt or 0.0, **{name: getattr(config, name) for name in names})
     except ValueError as error:
         raise SettingError(f"mjcf={config.mjcf}: {error}") from error
     name = Path(config.mjcf or "").stem
@@ -243,12 +243,12 @@ def of_mjcf(config: Config) -> Task:
 
 def mjcf_digest(task: Task) -> str | None:
     """SHA-256 of the compiled model of a task=mjcf, whatever files it was made of; None of another task."""
-    return mjcf.digest(task.plant.model) if isinstance(task.plant, mjcf.Mechanism) else None
+    return mjcf_plant.digest(task.plant.model) if isinstance(task.plant, mjcf_plant.Mechanism) else None
 
 
 def _model(config: Config) -> Any:
     try:
-        return mjcf.read(Path(config.mjcf or ""))
+        return mjcf_plant.read(Path(config.mjcf or ""))
     except ValueError as error:
         raise SettingError(f"mjcf={config.mjcf}: {error}") from error
 

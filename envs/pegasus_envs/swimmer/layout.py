@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from pegasus_envs.fluid import Drag, drag
 from pegasus_envs.physics import Physics
+from pegasus_envs.swimmer.drag import Drag, drag
 
 
 class Rigid(NamedTuple):

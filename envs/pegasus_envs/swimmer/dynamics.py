@@ -15,9 +15,9 @@ import numpy as np
 from jax import Array
 
 from pegasus_envs.batching import stored
-from pegasus_envs.fluid import Vector, resistance
 from pegasus_envs.inertia import solve
-from pegasus_envs.mechanism import Mechanism
+from pegasus_envs.swimmer.drag import Vector, resistance
+from pegasus_envs.swimmer.layout import Mechanism
 
 
 class Pose(NamedTuple):

@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from pegasus_envs import flippers, physics
-from pegasus_envs.attitude import angles_of, quaternion_of
+from pegasus_envs import physics
 from pegasus_envs.batching import batch_last
-from pegasus_envs.goals import START_DEPTH, Cost, Task, goal
-from pegasus_envs.mechanism import Mechanism, mechanism
 from pegasus_envs.physics import Motion, Scalar
 from pegasus_envs.plant import FRAME, Plant, draw_start, gliding
+from pegasus_envs.swimmer import dynamics
+from pegasus_envs.swimmer.goals import START_DEPTH, Cost, Task, goal
+from pegasus_envs.swimmer.layout import Mechanism, mechanism
+from pegasus_envs.swimmer.rotations import angles_of, quaternion_of
 
 XML = "swimmer.xml"
 LEGS = ("FL", "ML", "RL", "FR", "MR", "RR")
@@ -147,7 +148,7 @@ def _new_body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
         return Swimming(qpos, qvel, jnp.zeros((3, 6), x.dtype), jnp.zeros((), x.dtype), x[4:7])
 
     def swim(state: Swimming, target: Array, body: Mechanism, *, steps: int) -> Swimming:
-        accelerate = partial(flippers.acceleration, body)
+        accelerate = partial(dynamics.acceleration, body)
 
         def substep(carry: tuple[Motion, Array, Array], _: None) -> tuple[tuple[Motion, Array, Array], Array]:
             motion, command, stroke = carry
