@@ -8,7 +8,8 @@ import numpy as np
 import optax
 import pytest
 
-from pegasus_jax.learn.fit import fit, guarded
+from pegasus_jax.learn.data import minibatch
+from pegasus_jax.learn.fit import fit
 from pegasus_jax.types import Dataset, Learner
 from probes import same
 
@@ -31,7 +32,7 @@ def squares(params, key, batch, context):
 
 
 def make(loss=squares, optimizer=None, steps=50, batch=8, prepare=lambda data: None):
-    optimizer = optimizer or guarded(optax.adam(optax.cosine_decay_schedule(0.1, steps)))
+    optimizer = optimizer or optax.adam(optax.cosine_decay_schedule(0.1, steps))
     fitted = jax.jit(partial(fit, prepare=prepare, loss=loss, optimizer=optimizer, steps=steps, batch=batch))
     return fitted, Learner(jnp.zeros((2, 2)), optimizer.init(jnp.zeros((2, 2))))
 
@@ -49,10 +50,10 @@ def test_it_finds_the_least_squares_of_the_rows_in_use(junk):
 
 def test_the_losses_reported_are_those_of_the_first_and_last_tenth():
     """Each step's loss is its number here: gradient 1, step size 1, loss = -params."""
-    fitted, learner = make(lambda p, key, batch, context: jnp.sum(p), guarded(optax.sgd(0.25)), steps=40)
+    fitted, learner = make(lambda p, key, batch, context: jnp.sum(p), optax.sgd(0.25), steps=40)
     _, info = fitted(jax.random.key(0), learner, data(0))
     np.testing.assert_allclose([info.first, info.loss], [-1.5, -37.5])
-    fitted, learner = make(lambda p, key, batch, context: jnp.sum(p), guarded(optax.sgd(0.25)), steps=3)
+    fitted, learner = make(lambda p, key, batch, context: jnp.sum(p), optax.sgd(0.25), steps=3)
     _, info = fitted(jax.random.key(0), learner, data(0))
     np.testing.assert_allclose([info.first, info.loss], [0, -2])
 
@@ -60,7 +61,7 @@ def test_the_losses_reported_are_those_of_the_first_and_last_tenth():
 def test_prepare_sees_the_whole_data_set_and_the_loss_its_answer():
     fitted, learner = make(
         lambda p, key, batch, context: jnp.sum((p - context) ** 2),
-        guarded(optax.sgd(0.5)),
+        optax.sgd(0.5),
         steps=1,
         prepare=lambda data: data.size.astype(jnp.float32),
     )
@@ -78,7 +79,7 @@ def test_a_bad_gradient_skips_its_update_and_nothing_else(value):
         jax.debug.callback(lambda b: bad.append(bool(b)), spoiled)
         return jnp.sum(params * jnp.where(spoiled, value, 1.0))
 
-    optimizer = guarded(optax.chain(optax.scale_by_adam(), optax.scale(-1.0)))
+    optimizer = optax.chain(optax.scale_by_adam(), optax.scale(-1.0))
     fitted, learner = make(loss, optimizer, steps=40)
     learner, info = fitted(jax.random.key(0), learner, data(0))
     jax.effects_barrier()
@@ -87,8 +88,8 @@ def test_a_bad_gradient_skips_its_update_and_nothing_else(value):
     assert info.skipped == sum(bad)
     good = 40 - sum(bad)
     np.testing.assert_allclose(learner.params, -good * np.ones((2, 2)), rtol=1e-4)  # Adam's step on a constant gradient
-    assert learner.optimizer.inner_state[0].count == good
-    np.testing.assert_allclose(learner.optimizer.inner_state[0].mu, 1 - 0.9**good, rtol=1e-5)
+    assert learner.optimizer[0].count == good
+    np.testing.assert_allclose(learner.optimizer[0].mu, 1 - 0.9**good, rtol=1e-5)
     _, again = fitted(jax.random.key(1), learner, data(0))
     jax.effects_barrier()
     assert again.skipped == sum(bad[40:])  # each call counts its own
@@ -98,8 +99,55 @@ def test_a_fit_that_sees_nothing_but_bad_gradients_changes_nothing():
     fitted, learner = make(lambda p, key, batch, context: jnp.sum(p) * jnp.nan)
     after, info = fitted(jax.random.key(0), learner, data(0))
     assert same(after.params, learner.params)
-    assert same(after.optimizer.inner_state, learner.optimizer.inner_state)
+    assert same(after.optimizer, learner.optimizer)
     assert info.skipped == 50
+
+
+OPTIMIZERS = {
+    "adam": optax.adam(0.05),
+    "momentum": optax.sgd(0.02, momentum=0.9),
+    "clipped": optax.chain(optax.clip_by_global_norm(1.0), optax.adamw(0.05)),
+    "several steps": optax.MultiSteps(optax.adam(0.1), 2).gradient_transformation(),
+    "told the loss": optax.chain(optax.adam(0.05), optax.contrib.reduce_on_plateau(patience=20)),
+    "line search": optax.lbfgs(),
+    "guarded already": optax.apply_if_finite(optax.adam(0.05), 3),
+}
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_any_optimizer_fits_and_is_handed_back_in_its_own_state(name):
+    optimizer = OPTIMIZERS[name]
+    fitted, learner = make(optimizer=optimizer, steps=200, batch=32)
+    after, info = fitted(jax.random.key(0), learner, data(0))
+    assert info.loss < 0.5 * info.first
+    assert info.skipped == 0
+    assert jax.tree.structure(after.optimizer) == jax.tree.structure(optimizer.init(learner.params))
+    again, _ = fitted(jax.random.key(1), after, data(0))  # it goes on from that state
+    assert jnp.all(jnp.isfinite(again.params))
+
+
+def test_a_fit_is_the_loop_that_a_user_would_write():
+    """The guard costs no bit: the same updates, one after the other, by optax alone."""
+    optimizer = optax.adam(0.05)
+    fitted, learner = make(optimizer=optimizer, steps=5)
+    after, _ = fitted(jax.random.key(3), learner, data(0))
+    params, state = learner.params, optimizer.init(learner.params)
+    for key in jax.random.split(jax.random.key(3), 5):
+        row_key, noise_key = jax.random.split(key)
+        gradient = jax.grad(squares)(params, noise_key, minibatch(row_key, data(0), 8), None)
+        updates, state = optimizer.update(gradient, state, params)
+        params = optax.apply_updates(params, updates)
+    np.testing.assert_allclose(after.params, params, rtol=1e-6)
+    np.testing.assert_allclose(after.optimizer[0].mu, state[0].mu, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"), [("x", jnp.zeros(N)), ("u", jnp.zeros((N + 1, 1))), ("y", jnp.zeros((N, 3)))]
+)
+def test_data_of_other_shapes_are_refused_by_name(name, value):
+    fitted, learner = make()
+    with pytest.raises(ValueError, match=rf"^data\.{name} has shape .*; expected \[N, .\] "):
+        fitted(jax.random.key(0), learner, data(0)._replace(**{name: value}))
 
 
 def test_steps_differ_in_rows_and_noise_and_keys_decide_them():

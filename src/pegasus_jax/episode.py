@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import interrupt
+from pegasus_jax.shapes import check_shape
 from pegasus_jax.types import Array, Episode, Key, Task, Trajectory
 
 CUT = ("error", "interrupted")  # how an episode can end by no doing of its policy
@@ -41,12 +42,15 @@ def watch(
         t, key = t_and_key
         act_key, sensor_key = jax.random.split(key)
         u = act(act_key, t, x)
+        check_shape("what policy.apply returns", u, (len(task.control_names),), "[U]")
         looked = look(state, u)
         state = plant.step(state, u)
         after = measure(sensor_key, state)
         seen = plant.observe(state)
         over = jnp.zeros((), bool) if task.stop is None else task.stop(seen) > 0.5
-        return (state, after), (after, u, task.cost(seen), over, looked)
+        cost = task.cost(seen)
+        check_shape("the cost of one state", cost, ())
+        return (state, after), (after, u, cost, over, looked)
 
     state = plant.reset(begin)
     x = measure(first, state)

@@ -14,6 +14,7 @@ from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.search import SearchInfo
 from pegasus_jax.models.calibration import calibration
+from pegasus_jax.shapes import check_shape
 from pegasus_jax.types import (
     Array,
     Dataset,
@@ -265,8 +266,7 @@ def check_episode(state: RunState, trajectory: Trajectory) -> None:
     (states, controls), horizon = (state.data.x.shape[1], state.data.u.shape[1]), len(trajectory.u)
     shapes = dict(x=(horizon + 1, states), u=(horizon, controls), cost=(horizon,))
     for name, shape in shapes.items():
-        if jnp.shape(getattr(trajectory, name)) != shape:
-            raise ValueError(f"an episode's {name} has shape {jnp.shape(getattr(trajectory, name))}; expected {shape}")
+        check_shape(f"an episode's {name}", getattr(trajectory, name), shape)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state.data.size, trajectory))):
         return
     length = horizon if trajectory.length is None else int(trajectory.length)

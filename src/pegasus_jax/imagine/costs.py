@@ -9,7 +9,20 @@ import numpy as np
 
 from pegasus_jax.math.gaussian import saturating_cost, sincos
 from pegasus_jax.math.linalg import cholesky, mean_and_cov
+from pegasus_jax.shapes import check_shape
 from pegasus_jax.types import Array
+
+__all__ = [
+    "expected_by_nodes",
+    "expected_saturating",
+    "mean",
+    "of_matched",
+    "of_particles",
+    "saturating",
+    "total",
+    "until_stop",
+    "widened",
+]
 
 Cost = Callable[[Array], Array]  # x [D] -> scalar
 Error = Callable[[Array], Array]  # x [D] -> e [E], affine in the features of x
@@ -91,8 +104,14 @@ def normal_nodes(count: int, size: int) -> np.ndarray:
 
 
 def of_particles(cost: Cost) -> Callable[[Array], Array]:
-    """The cost of every particle: x [H, K, D] -> [H, K]."""
-    return jax.vmap(jax.vmap(cost))
+    """The cost of every particle: x [H, K, D] -> [H, K]. Raises ValueError where `cost` returns no scalar."""
+
+    def one(x: Array) -> Array:
+        value = cost(x)
+        check_shape("the cost of one state", value, ())
+        return value
+
+    return jax.vmap(jax.vmap(one))
 
 
 def until_stop(costs: Array, x: Array, stop: Callable[[Array], Array], stop_cost: float) -> Array:

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from pegasus_jax.shapes import check_params, check_scenarios, check_shape
 from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenarios
 
 # Platform -> steps of the time loop compiled as one. Each round of a loop costs a GPU copies and launches
@@ -41,7 +42,11 @@ def rollout(
     `moments.match` or `moments.keep`. No gradient flows through the predicted noise, nor, with `truncate`, through
     the states 0, truncate, 2 truncate, ...: truncated back-propagation through time. With a `limit`, none goes
     back through a particle's state that is longer than that.
+
+    Raises ValueError, while it is traced, where shapes do not agree; the message names the argument.
     """
+    check_params("policy_params", policy_params)
+    check_scenarios(scenarios)
     act = jax.vmap(policy.apply, (None, 0, 0))
     many = dynamics.particles or partial(jax.vmap, in_axes=(None, 0, 0, 0))
     predict = many(dynamics.apply)
@@ -54,7 +59,10 @@ def rollout(
         if limit is not None:
             x = limited(x, limit)
         u = act(policy_params, scenarios.policy, x + noise.policy * seeing)
+        check_shape("what policy.apply returns for K particles", u, (len(x), None), "[K, U]")
         change = predict(belief, scenarios.dynamics, x, u)
+        for name, value in change._asdict().items():
+            check_shape(f"{name} of what dynamics.apply returns for K particles", value, x.shape, "[K, D]")
         std = jax.lax.stop_gradient(change.std)
         blur = std * sensor
         after = match(x + change.mean + noise.state * blur, redraw)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optax
 
 from pegasus_jax.learn.data import minibatch
+from pegasus_jax.shapes import check_data
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Fitter, Key, Learner, Params
 
 
@@ -20,12 +21,12 @@ class FitInfo(NamedTuple):
 
 
 def guarded(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
-    """The optimiser, except that a gradient with a non-finite entry changes nothing and is counted."""
+    """The optimizer, except that a gradient with a non-finite entry changes nothing and is counted."""
     return optax.apply_if_finite(optimizer, max_consecutive_errors=2**31 - 1)
 
 
 def skipped(state: optax.OptState) -> Array:
-    """Updates a `guarded` optimiser has skipped so far."""
+    """Updates a `guarded` optimizer has skipped so far."""
     return state.total_notfinite  # type: ignore[union-attr]
 
 
@@ -40,20 +41,33 @@ def fit(
     steps: int,
     batch: int,
 ) -> tuple[Learner, FitInfo]:
-    """`steps` updates of the model's parameters, each on `batch` rows and fresh noise."""
+    """`steps` updates of the model's parameters, each on `batch` rows and fresh noise (Alg. 1 line 5).
+
+    `optimizer` is any of optax, and `learner.optimizer` its state, `optimizer.init(params)`. A gradient with a
+    non-finite entry changes neither. An optimizer that searches along a line gets the loss of the same rows and noise.
+    Raises ValueError for data of other shapes than a `Dataset` has.
+    """
+    check_data(data)
     context = prepare(data)
-    before = skipped(learner.optimizer)
+    guard = optax.with_extra_args_support(guarded(optimizer))
 
     def step(learner: Learner, key: Key) -> tuple[Learner, Array]:
         row_key, noise_key = jax.random.split(key)
         rows = minibatch(row_key, data, batch)
-        value, gradient = jax.value_and_grad(loss)(learner.params, noise_key, rows, context)
-        updates, state = optimizer.update(gradient, learner.optimizer, learner.params)
+
+        def of_rows(params: Params) -> Array:
+            return loss(params, noise_key, rows, context)
+
+        value, gradient = jax.value_and_grad(of_rows)(learner.params)
+        more = dict(value=value, grad=gradient, value_fn=of_rows)
+        updates, state = guard.update(gradient, learner.optimizer, learner.params, **more)
         return Learner(optax.apply_updates(learner.params, updates), state), value
 
-    learner, losses = jax.lax.scan(step, learner, jax.random.split(key, steps))
+    begun = guard.init(learner.params)._replace(inner_state=learner.optimizer)  # type: ignore[union-attr]
+    (params, ended), losses = jax.lax.scan(step, Learner(learner.params, begun), jax.random.split(key, steps))
     tenth = max(steps // 10, 1)
-    return learner, FitInfo(jnp.mean(losses[-tenth:]), jnp.mean(losses[:tenth]), skipped(learner.optimizer) - before)
+    info = FitInfo(jnp.mean(losses[-tenth:]), jnp.mean(losses[:tenth]), skipped(ended))
+    return Learner(params, ended.inner_state), info
 
 
 def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
@@ -67,21 +81,20 @@ def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
 def minibatches(
     dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch: int, reset: bool = False
 ) -> Fitter:
-    """The fitter that takes `optimizer`'s steps on minibatches; with `reset` each fit starts with fresh moments."""
-    guarded_optimizer = guarded(optimizer)
+    """The fitter that takes `optimizer`'s steps on minibatches; with `reset` each fit begins with a fresh state."""
 
     def run(key: Key, learner: Learner, data: Dataset, steps: int) -> tuple[Learner, FitInfo]:
         if reset:
-            learner = Learner(learner.params, guarded_optimizer.init(learner.params))
+            learner = Learner(learner.params, optimizer.init(learner.params))
         return fit(
             key,
             learner,
             data,
             prepare=dynamics.prepare,
             loss=dynamics.loss,
-            optimizer=guarded_optimizer,
+            optimizer=optimizer,
             steps=steps,
             batch=batch,
         )
 
-    return Fitter(guarded_optimizer.init, run)
+    return Fitter(optimizer.init, run)

@@ -1,0 +1,65 @@
+"""Shapes and types of what callers hand over, checked while a program is traced; a compiled program checks nothing."""
+
+from typing import Any
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.types import Dataset, Learner, Params, Scenarios
+
+Shape = tuple[int | None, ...]  # None: any size
+
+
+def check_shape(name: str, value: Any, shape: Shape, index: str = "") -> None:
+    """Raises ValueError, in one line, unless `value` has floating-point entries and this shape.
+
+    `index` are the letters of its axes, for the message: "[K, D]".
+    """
+    try:
+        chex.assert_shape(value, shape)
+    except AssertionError:
+        letters = f" {index}" if index else ""
+        raise ValueError(f"{name} has shape {jnp.shape(value)}; expected{letters} {_written(shape)}") from None
+    try:
+        chex.assert_type(value, float)
+    except AssertionError:
+        raise ValueError(f"{name} is of {jnp.result_type(value)}; expected floating-point numbers") from None
+
+
+def check_particles(name: str, tree: Params, particles: int) -> None:
+    """Raises ValueError unless every array of `tree` has one entry a particle [K, ...]."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if jnp.shape(leaf)[:1] != (particles,):
+            where = name + jax.tree_util.keystr(path)
+            raise ValueError(f"{where} has shape {jnp.shape(leaf)}; expected [K, ...] with K = {particles} particles")
+
+
+def check_params(name: str, params: Params) -> None:
+    """Raises ValueError for a `Learner` in place of its parameters."""
+    if isinstance(params, Learner):
+        raise ValueError(f"{name} is a Learner; expected its parameters, {name}=learner.params")
+
+
+def check_scenarios(scenarios: Scenarios) -> None:
+    """Raises ValueError unless the parts of the scenarios agree in K, H and D."""
+    check_shape("scenarios.start", scenarios.start, (None, None), "[K, D]")
+    (particles, states), horizon = scenarios.start.shape, jnp.shape(scenarios.match)[:1]
+    for name in ("match", "sensor"):
+        noise = getattr(scenarios, name)
+        check_shape(f"scenarios.{name}", noise, (*horizon, particles, states) if horizon else (None,) * 3, "[H, K, D]")
+    for name in ("dynamics", "policy"):
+        check_particles(f"scenarios.{name}", getattr(scenarios, name), particles)
+
+
+def check_data(data: Dataset) -> None:
+    """Raises ValueError unless x [N, D], u [N, U] and y [N, D] agree in N and D."""
+    check_shape("data.x", data.x, (None, None), "[N, D]")
+    check_shape("data.u", data.u, (len(data.x), None), "[N, U]")
+    check_shape("data.y", data.y, data.x.shape, "[N, D]")
+
+
+def _written(shape: Shape) -> str:
+    """The shape as Python prints it, with a star for any size."""
+    sizes = ["*" if size is None else str(size) for size in shape]
+    return f"({', '.join(sizes)}{',' if len(sizes) == 1 else ''})"
