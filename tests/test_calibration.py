@@ -74,7 +74,9 @@ def test_few_draws_say_nearly_the_same():
 
 def test_of_an_experiment_it_is_unknown_before_there_are_data_and_changes_nothing():
     task = cart()
-    exp = compose(tiny(fit__steps=5, search__steps=2), task, regression(2, 1), noisy_linear_policy(task))
+    exp = compose(
+        tiny(fit__steps=5, search__steps=2), task, dynamics=regression(2, 1), policy=noisy_linear_policy(task)
+    )
     state = exp.init(jax.random.key(0))
     collect, absorb, calibrate = (jax.jit(f) for f in (exp.collect, exp.absorb, exp.calibrate))
     assert np.isnan(calibrate(state, collect(state)))

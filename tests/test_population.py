@@ -109,7 +109,7 @@ def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_
 
 def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():
     chosen = tiny(trials=2, fit__steps=5, search__steps=4, search__particles=5, search__starts=3)
-    exp = compose(chosen, cart(), regression(2, 1), noisy_linear_policy(cart()))
+    exp = compose(chosen, cart(), dynamics=regression(2, 1), policy=noisy_linear_policy(cart()))
     state = exp.init(jax.random.key(0))
     after, (_, info) = unchecked(jax.jit(lambda s: exp.improve(exp.absorb(s, exp.collect(s)))))(state)
     shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (state.policy, after.policy)]

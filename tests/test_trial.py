@@ -27,8 +27,8 @@ class Watched:
         self.exp = compose(
             config,
             task,
-            dynamics._replace(loss=self.loss, apply=self.predict),
-            policy._replace(apply=self.act),
+            dynamics=dynamics._replace(loss=self.loss, apply=self.predict),
+            policy=policy._replace(apply=self.act),
         )
         self.init, self.collect = jax.jit(self.exp.init), jax.jit(self.exp.collect)
         self.absorb, self.fit = jax.jit(self.exp.absorb), jax.jit(self.exp.fit)
@@ -157,7 +157,7 @@ def test_the_first_episodes_are_random_controls_within_limits(watched, looped):
 def test_evaluation_never_explores(watched, looped):
     """Its controls are the policy's at every observed state: here without noise, so they can be computed."""
     config = tiny(**QUICK, policy__execution="mean")
-    exp = compose(config, cart(), regression(2, 1), noisy_linear_policy(cart()))
+    exp = compose(config, cart(), dynamics=regression(2, 1), policy=noisy_linear_policy(cart()))
     params = looped[0][3].policy.params
     fly = jax.jit(exp.episode)
     flight = fly(jax.random.key(1), params, False)
@@ -178,8 +178,8 @@ def test_forgetting_adams_moments_or_not(watched, looped):
     )
     assert same(watched.search(state)[0], watched.search(forgot)[0]._replace(model=state.model))
     assert not same(watched.fit(state)[0].model.params, watched.fit(forgot)[0].model.params)
-    pieces = watched.exp.dynamics, watched.exp.policy
-    other = compose(tiny(**QUICK, fit__reset=True, search__reset=False), watched.exp.task, *pieces)
+    pieces = dict(dynamics=watched.exp.dynamics, policy=watched.exp.policy)
+    other = compose(tiny(**QUICK, fit__reset=True, search__reset=False), watched.exp.task, **pieces)
     fit, search = jax.jit(other.fit), jax.jit(other.search)
     assert same(fit(state)[0].model, fit(forgot)[0].model)
     assert not same(search(state)[0].policy.params, search(forgot)[0].policy.params)
@@ -267,7 +267,7 @@ def test_the_whole_loop_learns_a_probe():
 
 def test_a_run_longer_than_its_data_set_is_refused():
     """Capacity is that of config.trials; one more episode would overwrite the last one's rows, silently."""
-    exp = compose(tiny(**QUICK), cart(), regression(2, 1), noisy_linear_policy(cart()))
+    exp = compose(tiny(**QUICK), cart(), dynamics=regression(2, 1), policy=noisy_linear_policy(cart()))
     with pytest.raises(ValueError, match="trials"):
         unchecked(jax.eval_shape)(run(exp, TRIALS + 1, 1), jax.random.key(0))
 
@@ -302,7 +302,9 @@ def test_a_search_starts_from_the_better_of_the_old_policy_and_a_fresh_one(offse
 
 def test_random_episodes_come_before_any_learning():
     """With two random trials the first leaves model and policy as they were, and says so."""
-    exp = compose(tiny(**QUICK, explore__trials=2), cart(), regression(2, 1), noisy_linear_policy(cart()))
+    exp = compose(
+        tiny(**QUICK, explore__trials=2), cart(), dynamics=regression(2, 1), policy=noisy_linear_policy(cart())
+    )
     first = exp.init(jax.random.key(5))
     last, info = unchecked(jax.jit(run(exp, 3, EPISODES)))(jax.random.key(5))
     unknown = [True, False, False]
@@ -322,7 +324,7 @@ def test_a_successor_takes_over_where_it_is_expected_to_cost_less(better, compar
     """Fresh scenarios under the new model: a policy of gain 0 does nothing for a cart that a gain of -1 stops."""
     task = cart()
     true = Linear(np.array([[1, 0.3], [0, 1]]), np.array([[0.045], [0.3]]), np.eye(2), np.zeros(2), np.zeros(2), 8)
-    exp = compose(tiny(**QUICK, successor=compare), task, known(true), noisy_linear_policy(task))
+    exp = compose(tiny(**QUICK, successor=compare), task, dynamics=known(true), policy=noisy_linear_policy(task))
     state = exp.init(jax.random.key(0))
     idle, good = jnp.zeros((1, 2)), jnp.array([[-0.8, -1.2]])
     new, old = (good, idle) if better else (idle, good)

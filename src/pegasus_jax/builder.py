@@ -39,6 +39,7 @@ from pegasus_jax.policies.squash import SQUASHES, to_limits
 from pegasus_jax.sharding import Spread, over_particles, together
 from pegasus_jax.types import (
     Array,
+    Cost,
     Dropout,
     Dynamics,
     Experiment,
@@ -74,26 +75,33 @@ def build(config: settings.Config, mesh: Mesh | None = None) -> Experiment:
 def compose(
     config: settings.Config,
     task: Task,
+    *,
     dynamics: Dynamics | None = None,
     policy: Policy | None = None,
+    fitter: Fitter | None = None,
+    searcher: Searcher | None = None,
+    cost: Cost | None = None,
     mesh: Mesh | None = None,
 ) -> Experiment:
-    """The experiment of a config on any task; a model or policy of your own takes the configured one's place.
+    """The experiment of a config on any task, with pieces of your own in place of the configured or the task's ones.
 
-    With a `mesh` (mesh.py) the particles of a search are spread over its devices.
+    A `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
+    With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises SettingError where a piece
+    does not suit the config: a cost without a width, for example, needs `search.widen=1`.
     """
+    task = task if cost is None else with_cost(task, cost)
     dynamics = dynamics or dynamics_of(config.model, task)
     policy = policy or policy_of(config.policy, task)
-    searcher, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
+    configured, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)
     explore = config.explore
     return experiment(
         task=task,
         dynamics=dynamics,
         policy=policy,
-        fit=fit_of(config.fit, dynamics),
+        fit=fitter or fit_of(config.fit, dynamics),
         fit_steps=config.fit.steps,
-        search=searcher,
+        search=searcher or configured,
         search_steps=config.search.steps,
         search_reset=config.search.reset,
         search_restart=config.search.restart,
@@ -105,6 +113,13 @@ def compose(
         mean_execution=config.policy.execution == "mean",
         capacity=config.trials * task.horizon,
     )
+
+
+def with_cost(task: Task, cost: Cost) -> Task:
+    """The task with another cost. Raises SettingError for a bare function."""
+    if not isinstance(cost, Cost):
+        raise SettingError(f"cost={cost!r} is no Cost; a function of one state x [D] makes one: Cost(function)")
+    return task._replace(cost=cost.of_state, expected_cost=cost.expected, widened=cost.widen)
 
 
 def set_precision(config: settings.Config) -> None:

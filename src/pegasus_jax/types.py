@@ -120,6 +120,16 @@ class Policy(NamedTuple):
     adapt: Callable[[Params, Dataset], Params] | None = None
 
 
+class Cost(NamedTuple):
+    """What a search is to make small: a differentiable function of one state, in [0, 1]."""
+
+    of_state: Callable[[Array], Array]  # x [D] -> scalar
+    # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not in closed form, but by cost.expected_by_nodes
+    expected: Callable[[Array, Array], Array] | None = None
+    # A factor -> (of_state, expected) of the same error with that many times the width. None: the cost has no width.
+    widen: Callable[[Array], tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]] | None = None
+
+
 class Task(NamedTuple):
     """What is to be learned: a plant's interface, a cost, and where episodes start."""
 
