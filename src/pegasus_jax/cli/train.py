@@ -103,9 +103,11 @@ def _resumed(options: dict[str, str], rest: dict[str, str]) -> Asked:
 
 def _new(options: dict[str, str], rest: dict[str, str]) -> Asked:
     from pegasus_jax import defaults
-    from pegasus_jax.runs import config_io, store
+    from pegasus_jax.runs import config_io
 
     config = config_io.parse(rest, options=OPTIONS)
+    from pegasus_jax.runs import store  # it imports NumPy, which a refused command does not wait for
+
     seeds = range(config.seed, config.seed + whole("seeds", options.get("seeds", "1")))
     name = f"seed{seeds[0]}" if len(seeds) == 1 else f"seeds{seeds[0]}-{seeds[-1]}"
     home = Path(options["out"]) if "out" in options else store.free(Path(f"runs/{defaults.label(config)}-{name}"))

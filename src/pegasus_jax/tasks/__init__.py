@@ -1,23 +1,15 @@
-"""Task names -> tasks. The only importer of pegasus_envs."""
+"""Task names -> tasks. The only importer of pegasus_envs, and with it of MuJoCo and Gymnasium, once a task is made."""
 
 import dataclasses
 import os
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import gymnasium
 import numpy as np
 
-from pegasus_envs import mjcf_check, mjcf_plant
-from pegasus_envs.cartpole import cartpole
-from pegasus_envs.double_cartpole import double_cartpole
-from pegasus_envs.gym_plant import EnvSpec, env_plant, env_spec, make_env, starts
-from pegasus_envs.gym_plant import close_environments as close_environments
-from pegasus_envs.plant import Plant
-from pegasus_envs.render import frames, unstack
-from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax import interrupt
 from pegasus_jax.checks import SettingError, nearest
 from pegasus_jax.config import Config
@@ -26,8 +18,13 @@ from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
 from pegasus_jax.tasks import user_code
 from pegasus_jax.types import Task
 
+if TYPE_CHECKING:
+    from pegasus_envs.plant import Plant
 
-def of_plant(name: str, plant: Plant) -> Task:
+__all__ = ["make", "of_config"]
+
+
+def of_plant(name: str, plant: "Plant") -> Task:
     """The task a plant of pegasus_envs poses."""
     return Task(
         name=name,
@@ -49,11 +46,29 @@ def of_plant(name: str, plant: Plant) -> Task:
     )
 
 
+def _cartpole(_: int) -> "Plant":
+    from pegasus_envs.cartpole import cartpole
+
+    return cartpole()
+
+
+def _double_cartpole(_: int) -> "Plant":
+    from pegasus_envs.double_cartpole import double_cartpole
+
+    return double_cartpole()
+
+
+def _swimmer(manoeuvre: str, legs: int) -> "Plant":
+    from pegasus_envs.swimmer.plant import swimmer
+
+    return swimmer(manoeuvre, legs)
+
+
 # Name -> the plant, given how many of its legs a swimmer drives.
-TASKS: dict[str, Callable[[Any], Plant]] = {
-    "cartpole": lambda legs: cartpole(),
-    "double_cartpole": lambda legs: double_cartpole(),
-    **{f"swimmer_{manoeuvre}": partial(swimmer, manoeuvre) for manoeuvre in MANOEUVRES},
+TASKS: dict[str, Callable[[Any], "Plant"]] = {
+    "cartpole": _cartpole,
+    "double_cartpole": _double_cartpole,
+    **{f"swimmer_{manoeuvre}": partial(_swimmer, manoeuvre) for manoeuvre in MANOEUVRES},
 }
 
 
@@ -109,6 +124,8 @@ def pinned(config: Config) -> Config:
     with it, neither opens nor resets it: it may be a robot.
     """
     if config.task == GYM:
+        from pegasus_envs.gym_plant import EnvSpec, env_spec
+
         _complete(config)
         environment(config)
         given = {name: getattr(config, name) for name in EnvSpec._fields}
@@ -131,6 +148,8 @@ def pinned(config: Config) -> Config:
 
 def of_gym(config: Config) -> Task:
     """The task that a Gymnasium environment and a cost of its observations pose. Raises SettingError if they cannot."""
+    from pegasus_envs.gym_plant import EnvSpec, env_plant
+
     _complete(config)
     known: dict[str, Any] = {name: getattr(config, name) for name in EnvSpec._fields}
     if any(value in (None, ()) for value in known.values()):
@@ -144,6 +163,14 @@ def of_gym(config: Config) -> Task:
         rates=_entries("rates", config.rates, name, len(states)),
         environment=env_plant(name, config.env_args, len(states)),
     )
+
+
+def close_environments() -> None:
+    """Close every environment that is open; none is before the module that opens them was imported."""
+    if "pegasus_envs.gym_plant" in sys.modules:
+        from pegasus_envs.gym_plant import close_environments as close_all
+
+        close_all()
 
 
 def close(task: Task) -> None:
@@ -177,6 +204,8 @@ def readings(config: Config, task: Task, resets: int) -> np.ndarray:
     """
     if config.task != GYM:
         return np.zeros((0, len(task.state_names)))
+    from pegasus_envs.gym_plant import starts
+
     with user_code.blamed(f"env={config.env} cannot be reset"):
         return starts(config.env or "", config.env_args, resets)
 
@@ -184,6 +213,8 @@ def readings(config: Config, task: Task, resets: int) -> np.ndarray:
 def compared(config: Config, task: Task) -> None:
     """Raises SettingError, in one line, where MJX does not simulate a task's MJCF file as MuJoCo does."""
     if config.task == MJCF:
+        from pegasus_envs import mjcf_check
+
         try:
             mjcf_check.compare(task.plant)
         except ValueError as error:
@@ -207,6 +238,10 @@ def described(config: Config) -> dict[str, str]:
 
 def environment(config: Config) -> Any:
     """The environment of a config, opened once a process. Raises SettingError, in one line, where it cannot be made."""
+    import gymnasium
+
+    from pegasus_envs.gym_plant import make_env
+
     name, _, _ = (config.env or "").rpartition(":")
     if name:
         user_code.importing(f"env={config.env}", name)
@@ -230,6 +265,8 @@ def of_mjcf(config: Config) -> Task:
             "task=mjcf needs mjcf=, cost=, dt= and horizon=; for example "
             "mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40"
         )
+    from pegasus_envs import mjcf_plant
+
     model = _model(config)
     names = ("observe", "control_low", "control_high", "start_mean", "start_std")
     try:
@@ -243,10 +280,16 @@ def of_mjcf(config: Config) -> Task:
 
 def mjcf_digest(task: Task) -> str | None:
     """SHA-256 of the compiled model of a task=mjcf, whatever files it was made of; None of another task."""
+    if task.plant is None:
+        return None
+    from pegasus_envs import mjcf_plant
+
     return mjcf_plant.digest(task.plant.model) if isinstance(task.plant, mjcf_plant.Mechanism) else None
 
 
 def _model(config: Config) -> Any:
+    from pegasus_envs import mjcf_plant
+
     try:
         return mjcf_plant.read(Path(config.mjcf or ""))
     except ValueError as error:
@@ -289,4 +332,6 @@ def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> 
 
 def pictures(task: Task, states: Any, width: int, height: int) -> list[np.ndarray]:
     """Pictures [height, width, 3] of stacked states [N, ...] of the task's plant."""
+    from pegasus_envs.render import frames, unstack
+
     return frames(task.plant, unstack(states), width, height)
