@@ -46,9 +46,9 @@ def test_wheel_holds_both_packages_and_their_assets(wheel: zipfile.ZipFile) -> N
         f"{name}/{path.relative_to(folder).as_posix()}"
         for name, folder in PACKAGES.items()
         for path in folder.rglob("*")
-        if path.suffix in {".py", ".xml"}
+        if path.suffix in {".py", ".xml"} or path.name == "py.typed"
     }
-    assert {"pegasus_jax/__init__.py", "pegasus_envs/__init__.py"} <= expected
+    assert {"pegasus_jax/__init__.py", "pegasus_jax/py.typed", "pegasus_envs/__init__.py"} <= expected
     assert any(re.fullmatch(r"pegasus_envs/assets/\w+\.xml", name) for name in expected)
     assert expected <= set(wheel.namelist())
 

@@ -1,47 +1,160 @@
 """Learn a neural-network controller from a few minutes of robot time.
 
-Everything here is a plain function or a plain value, to be jitted, vmapped and differentiated in your own code.
+Everything here is a plain function or a plain value, to be jitted, vmapped and differentiated in your own code. What
+each name is for: docs/design.md, "Public names".
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pegasus_jax import tasks
-    from pegasus_jax.builder import build, compose
+    from pegasus_jax import config, tasks
+    from pegasus_jax.builder import build, compose, dynamics_of, policy_of
+    from pegasus_jax.checks import RunError, SettingError
     from pegasus_jax.config import Config
-    from pegasus_jax.experiment import run, trial
-    from pegasus_jax.imagine.rollout import rollout
-    from pegasus_jax.imagine.scenarios import draw
-    from pegasus_jax.learn.fit import fit
-    from pegasus_jax.learn.search import objective, optimise
-    from pegasus_jax.runs.controller import controller
+    from pegasus_jax.experiment import TrialInfo, run, trial
+    from pegasus_jax.imagine import costs, matching
+    from pegasus_jax.imagine.rollout import NoiseUse, rollout
+    from pegasus_jax.imagine.scenarios import Blocks, blocks, draw
+    from pegasus_jax.learn import data
+    from pegasus_jax.learn.fit import FitInfo, fit, minibatches
+    from pegasus_jax.learn.schedule import Course
+    from pegasus_jax.learn.search import SearchInfo, objective, optimise, particles
+    from pegasus_jax.math import angles, gaussian
+    from pegasus_jax.models import dropout as dropouts
+    from pegasus_jax.models.bnn import bnn
+    from pegasus_jax.models.ensemble import ensemble
+    from pegasus_jax.models.lagrangian import lagrangian
+    from pegasus_jax.pilco.gp import gp
+    from pegasus_jax.pilco.rbf import rbf
+    from pegasus_jax.pilco.ssgp import ssgp
+    from pegasus_jax.policies.linear import linear
+    from pegasus_jax.policies.mlp import mlp
+    from pegasus_jax.policies.wrap import of_pair
+    from pegasus_jax.runs.controller import Controller, controller
+    from pegasus_jax.types import (
+        Batch,
+        Cost,
+        Dataset,
+        Dropout,
+        Dynamics,
+        Episode,
+        Experiment,
+        Fitter,
+        Learner,
+        Period,
+        Policy,
+        Prediction,
+        Rollout,
+        RunState,
+        Scenarios,
+        Searcher,
+        Successor,
+        Task,
+        Trajectory,
+    )
 
-_MODULES = {
-    "Config": "config",
-    "build": "builder",
-    "compose": "builder",
-    "controller": "runs.controller",
-    "draw": "imagine.scenarios",
-    "fit": "learn.fit",
-    "objective": "learn.search",
-    "optimise": "learn.search",
-    "rollout": "imagine.rollout",
-    "run": "experiment",
-    "tasks": "tasks",
-    "trial": "experiment",
+# Module -> its public names, in the order in which a reader needs them.
+_NAMES = {
+    # a run, from settings
+    "config": "Config",
+    "builder": "build compose dynamics_of policy_of",
+    "experiment": "run trial TrialInfo",
+    "checks": "SettingError RunError",
+    "runs.controller": "controller Controller",
+    # the method, function by function
+    "imagine.scenarios": "blocks Blocks draw",
+    "imagine.rollout": "rollout NoiseUse",
+    "learn.fit": "fit FitInfo minibatches",
+    "learn.search": "objective optimise particles SearchInfo",
+    "learn.schedule": "Course",
+    # models and policies
+    "models.bnn": "bnn",
+    "models.ensemble": "ensemble",
+    "models.lagrangian": "lagrangian",
+    "pilco.gp": "gp",
+    "pilco.ssgp": "ssgp",
+    "policies.mlp": "mlp",
+    "policies.linear": "linear",
+    "policies.wrap": "of_pair",
+    "pilco.rbf": "rbf",
+    # the values that pass between them
+    "types": "Task Cost Trajectory Episode Dataset Batch Dynamics Prediction Dropout Policy Scenarios Period Rollout"
+    " Learner Fitter Searcher Experiment RunState Successor",
 }
+# Families of functions, each a module under a name of its own: `pegasus_jax.costs.mean`.
+_FAMILIES = {
+    "angles": "math.angles",
+    "config": "config",
+    "costs": "imagine.costs",
+    "data": "learn.data",
+    "dropouts": "models.dropout",
+    "gaussian": "math.gaussian",
+    "matching": "imagine.matching",
+    "tasks": "tasks",
+}
+_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
+
 __all__ = [
+    "Batch",
+    "Blocks",
     "Config",
+    "Controller",
+    "Cost",
+    "Course",
+    "Dataset",
+    "Dropout",
+    "Dynamics",
+    "Episode",
+    "Experiment",
+    "FitInfo",
+    "Fitter",
+    "Learner",
+    "NoiseUse",
+    "Period",
+    "Policy",
+    "Prediction",
+    "Rollout",
+    "RunError",
+    "RunState",
+    "Scenarios",
+    "SearchInfo",
+    "Searcher",
+    "SettingError",
+    "Successor",
+    "Task",
+    "Trajectory",
+    "TrialInfo",
+    "angles",
+    "blocks",
+    "bnn",
     "build",
     "compose",
+    "config",
     "controller",
+    "costs",
+    "data",
     "draw",
+    "dropouts",
+    "dynamics_of",
+    "ensemble",
     "fit",
+    "gaussian",
+    "gp",
+    "lagrangian",
+    "linear",
+    "matching",
+    "minibatches",
+    "mlp",
     "objective",
+    "of_pair",
     "optimise",
+    "particles",
+    "policy_of",
+    "rbf",
     "rollout",
     "run",
+    "ssgp",
     "tasks",
     "trial",
 ]
@@ -49,11 +162,16 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     """A name is imported when somebody asks for it, so that a command speaks before JAX is there."""
+    if name == "__version__":
+        from importlib.metadata import version
+
+        return version("pegasus-jax")
+    if name in _FAMILIES:
+        return import_module(f"{__name__}.{_FAMILIES[name]}")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__} has no attribute {name}")
-    module = import_module(f"{__name__}.{_MODULES[name]}")
-    return module if name == "tasks" else getattr(module, name)
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*__all__, "__version__"]

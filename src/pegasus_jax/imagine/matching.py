@@ -4,6 +4,8 @@ from pegasus_jax.math.linalg import cholesky, mean_and_cov
 from pegasus_jax.sharding import alone_on_gpu
 from pegasus_jax.types import Array
 
+__all__ = ["keep", "match"]
+
 
 def match(x: Array, z: Array) -> Array:
     """Particles [K, D] redrawn as mean + L z from the Gaussian fitted to x [K, D]; z [K, D] is standard normal.

@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from pegasus_jax.math.angles import difference
 from pegasus_jax.types import Array, Batch, Dataset, Key, Trajectory
 
+__all__ = ["add", "empty", "grow", "minibatch"]
+
 
 def empty(capacity: int, states: int, controls: int) -> Dataset:
     """A data set of `capacity` rows, none in use."""

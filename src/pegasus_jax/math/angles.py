@@ -7,6 +7,8 @@ import numpy as np
 
 from pegasus_jax.types import Array
 
+__all__ = ["difference", "encode", "feature_names", "wrap"]
+
 
 def encode(x: Array, angles: tuple[int, ...]) -> Array:
     """Features [..., F] of states x [..., D]: the other dimensions, then all sines, then all cosines; F = D + A."""

@@ -24,6 +24,8 @@ import numpy as np
 from pegasus_jax.math.linalg import cholesky
 from pegasus_jax.types import Array
 
+__all__ = ["Image", "affine", "chain", "joint", "residual", "sincos", "squash"]
+
 
 class Image(NamedTuple):
     """The Gaussian that matches f(x), and how it hangs together with x."""

@@ -26,6 +26,8 @@ from pegasus_jax.types import Dropout
 _LOG_UNIFORM_CONSTANT = 0.5 * (0.5772156649015329 + math.log(2.0))
 _SQRT_2 = math.sqrt(2.0)
 
+__all__ = ["binary", "concrete", "gaussian", "log_normal", "none", "sparse"]
+
 
 def none() -> Dropout:
     """No noise: z = 1."""

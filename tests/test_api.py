@@ -1,0 +1,498 @@
+"""The public names: each can be called with the others alone, and what a signature names is public too."""
+
+import dataclasses
+import inspect
+import itertools
+import re
+import subprocess
+import sys
+import typing
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import pegasus_jax as pg
+from folders import a_run
+from probes import unchecked
+
+_counter = itertools.count()
+
+
+def key() -> jax.Array:
+    """A key that nobody had before."""
+    return jax.random.key(next(_counter))
+
+
+K, H, D, U = 5, 4, 2, 1
+X, CONTROL = jnp.array([0.3, -0.2]), jnp.array([0.1])
+CONFIG = pg.Config(
+    trials=2,
+    model=pg.config.BNN(hidden=(4,)),
+    policy=pg.config.MLP(hidden=(4,)),
+    fit=pg.config.Fit(steps=3, batch=4),
+    search=pg.config.Search(steps=2, particles=K),
+)
+
+
+# A task and its pieces, of exported names alone
+
+
+class Plant(NamedTuple):
+    """What a task asks of a plant: a cart, of position and velocity, that a force drives."""
+
+    reset: Callable[[jax.Array], jax.Array] = lambda key: jax.random.normal(key, (D,))
+    step: Callable[[jax.Array, jax.Array], jax.Array] = lambda x, u: x + 0.3 * jnp.stack([x[1], u[0]])
+    observe: Callable[[jax.Array], jax.Array] = lambda x: x
+
+
+def error(x: jax.Array) -> jax.Array:
+    return x
+
+
+COST = pg.Cost(
+    pg.costs.saturating(error, 1.0),
+    expected=pg.costs.expected_saturating(error, 1.0, ()),
+    widen=partial(pg.costs.widened, error, 1.0, ()),
+)
+TASK = pg.Task(
+    name="cart",
+    plant=Plant(),
+    cost=COST.of_state,
+    expected_cost=COST.expected,
+    widened=COST.widen,
+    angles=(),
+    start_mean=np.zeros(D),
+    start_std=np.ones(D),
+    sensor_std=np.full(D, 0.01),
+    control_low=np.array([-2.0]),
+    control_high=np.array([2.0]),
+    horizon=H,
+    dt=0.3,
+    state_names=("position", "velocity"),
+    control_names=("force",),
+    rates=(1,),
+)
+DYNAMICS, POLICY = pg.dynamics_of(CONFIG.model, TASK), pg.policy_of(CONFIG.policy, TASK)
+
+
+def trajectory() -> pg.Trajectory:
+    x = jnp.linspace(0.0, 1.0, (H + 1) * D).reshape(H + 1, D)
+    return pg.Trajectory(x, jnp.linspace(-1.0, 1.0, H)[:, None], jnp.zeros(H))
+
+
+def experience() -> pg.Dataset:
+    return pg.data.add(pg.data.empty(2 * H, D, U), trajectory(), ())
+
+
+def blocks() -> pg.Blocks:
+    start = lambda key: jax.random.normal(key, (D,))  # noqa: E731
+    return pg.blocks(dynamics=DYNAMICS, policy=POLICY, start=start, particles=K, horizon=H, balanced=False)
+
+
+class Imagined(NamedTuple):
+    """What a rollout and an objective take."""
+
+    params: Any
+    belief: Any
+    scenarios: pg.Scenarios
+
+
+def imagined() -> Imagined:
+    belief = DYNAMICS.condition(DYNAMICS.init(key()), experience())
+    return Imagined(POLICY.init(key()), belief, pg.draw(key(), 0, belief, blocks=blocks(), period=pg.Period()))
+
+
+PIECES: dict[str, Any] = dict(dynamics=DYNAMICS, policy=POLICY, match=pg.matching.match)
+J = partial(pg.objective, **PIECES, cost=pg.costs.of_particles(TASK.cost))
+
+
+# An example of every exported function; what it returns must be finite
+
+EXAMPLES: dict[str, Callable[[], Any]] = {}
+IMPURE = {"build", "compose", "controller", "tasks.make", "tasks.of_config", "angles.feature_names"}
+
+
+def example(*names: str) -> Callable[[Callable[[], Any]], Callable[[], Any]]:
+    """Register an example of these names."""
+
+    def register(function: Callable[[], Any]) -> Callable[[], Any]:
+        EXAMPLES.update(dict.fromkeys(names, function))
+        return function
+
+    return register
+
+
+@example("build")
+def _() -> Any:
+    state = jax.eval_shape(pg.build(CONFIG).init, key())
+    assert isinstance(state, pg.RunState)
+    assert state.data.x.shape == (50, 4)
+
+
+@example("compose")
+def _() -> Any:
+    """Every piece of one's own takes the configured one's place."""
+    fitted = pg.minibatches(DYNAMICS, optax.sgd(1e-3, momentum=0.9), batch=3)
+    still = pg.Searcher(init=lambda params: (), run=lambda key, learner, *_, **__: (learner, "searched"))
+    twice = pg.Cost(lambda x: 2 * jnp.sum(x**2))
+    config = dataclasses.replace(CONFIG, search=dataclasses.replace(CONFIG.search, widen=1.0))
+    own: dict[str, Any] = dict(dynamics=DYNAMICS, policy=POLICY, fitter=fitted, searcher=still, cost=twice)
+    experiment = pg.compose(config, TASK, **own)
+    state = experiment.init(key())
+    assert jax.tree.structure(state.model.optimizer) == jax.tree.structure(fitted.init(state.model.params))
+    state = experiment.absorb(state, experiment.collect(state))
+    searched, info = experiment.search(state)
+    assert info == "searched"
+    assert experiment.task.cost(X) == pytest.approx(2 * float(X @ X))
+    assert experiment.imagine(searched)[1].shape == (H, K)
+    return experiment.fit(state)[1]
+
+
+@example("run", "trial")
+def _() -> Any:
+    experiment = pg.compose(CONFIG, TASK)
+    state, info = pg.run(experiment, 1, episodes=2)(key())
+    assert info.evaluation.shape == (1, 2, H)
+    state, info = pg.trial(state, experiment, episodes=2)
+    return state.data, info.evaluation, state.policy.params
+
+
+@example("controller")
+def _() -> Any:
+    raise AssertionError("needs a run's folder: see below")
+
+
+def test_a_controller_of_a_run(tmp_path: Any) -> None:
+    control = pg.controller(a_run(tmp_path / "run", trials=1), trial="last")
+    assert isinstance(control, pg.Controller)
+    assert control(np.zeros(4)).shape == (1,)
+
+
+@example("dynamics_of", "bnn", "ensemble", "lagrangian", "gp", "ssgp")
+def _() -> Any:
+    shape: dict[str, Any] = dict(states=D, controls=U, angles=())
+    head = lambda raw: 0.1 * jax.nn.sigmoid(raw)  # noqa: E731
+    network: dict[str, Any] = dict(hidden=(4,), head=head, dropout=pg.dropouts.log_normal())
+    of_network = pg.bnn(**shape, **network, input_dropout=None, heteroscedastic=True, full_whitening=True)
+    mechanism = pg.lagrangian(**shape, **network, rates=(1,), dt=0.3, substeps=1, activation="tanh")
+    models = (pg.ensemble(of_network, 2), mechanism, pg.gp(**shape, features=4), pg.ssgp(**shape, points=3), DYNAMICS)
+    return [predicted(model) for model in models]
+
+
+def predicted(model: pg.Dynamics) -> pg.Prediction:
+    belief = model.condition(model.init(key()), experience())
+    change = model.apply(belief, model.sample(key(), belief), X, CONTROL)
+    assert change.mean.shape == change.std.shape == (D,)
+    return change
+
+
+@example("policy_of", "mlp", "linear", "of_pair", "rbf")
+def _() -> Any:
+    encode, squash = partial(pg.angles.encode, angles=()), jnp.tanh
+    shape: dict[str, Any] = dict(encode=encode, controls=U, saturate=squash)
+    start = lambda key: jax.random.normal(key, (D,))  # noqa: E731
+    policies = (
+        POLICY,
+        pg.mlp(**shape, features=D, hidden=(3,), dropout=pg.dropouts.binary(0.2), initialiser="glorot"),
+        pg.linear(**shape, features=D, saturate_moments=None),
+        pg.rbf(**shape, start=start, waves=0, units=3, saturate_moments=lambda mean, cov: None),  # type: ignore[arg-type]
+        pg.of_pair(lambda key: jax.random.normal(key, (U, D)), lambda gain, features: gain @ features, TASK),
+    )
+    controls = [policy.apply(policy.init(key()), policy.sample(key()), X) for policy in policies]
+    assert all(u.shape == (U,) for u in controls)
+    return controls
+
+
+@example("blocks", "draw", "rollout", "matching.match", "matching.keep")
+def _() -> Any:
+    x, z = jax.random.normal(key(), (2, K, D))
+    assert pg.matching.keep(x, z) is x
+    pieces = {**PIECES, "noise": pg.NoiseUse(state=1.0)}
+    found = [pg.rollout(*imagined(), **{**pieces, "match": match}) for match in (pg.matching.match, pg.matching.keep)]
+    assert all(one.x.shape == (H + 1, K, D) for one in found)
+    return found
+
+
+@example("objective")
+def _() -> Any:
+    return jax.value_and_grad(J)(*imagined())
+
+
+@example("fit", "minibatches")
+def _() -> Any:
+    optimizer, params = optax.adam(1e-3), DYNAMICS.init(key())
+    learner = pg.Learner(params, optimizer.init(params))
+    how: dict[str, Any] = dict(prepare=DYNAMICS.prepare, loss=DYNAMICS.loss, optimizer=optimizer, batch=4)
+    by_hand = pg.fit(key(), learner, experience(), steps=3, **how)
+    fitter = pg.minibatches(DYNAMICS, optimizer, batch=4)
+    return by_hand, fitter.run(key(), pg.Learner(params, fitter.init(params)), experience(), 3)
+
+
+@example("optimise", "particles")
+def _() -> Any:
+    params, belief, _ = imagined()
+    searcher = pg.particles(J, optax.adam(1e-3), blocks=blocks(), period=pg.Period(), course=pg.Course())
+    learner, info = searcher.run(key(), pg.Learner(params, searcher.init(params)), belief, steps=2)
+    assert info.objective.shape == (2,)
+    return learner.params, info
+
+
+@example(*(f"costs.{name}" for name in pg.costs.__all__))
+def _() -> Any:
+    of_state, expected = pg.costs.widened(error, 1.0, (), 2.0)
+    x = jax.random.normal(key(), (H, K, D))
+    each = pg.costs.of_particles(of_state)(x)
+    stopped = pg.costs.until_stop(each, x, lambda x: x[0] > 1, 1.0)
+    assert each.shape == stopped.shape == (H, K)
+    assert pg.costs.of_matched(expected)(x).shape == (H, 1)
+    by_nodes = pg.costs.expected_by_nodes(pg.costs.saturating(error, 1.0), D)
+    closed = pg.costs.expected_saturating(error, 1.0, ())
+    return by_nodes(X, jnp.eye(D)), closed(X, jnp.eye(D)), pg.costs.mean(stopped), pg.costs.total(each)
+
+
+def test_the_two_expectations_of_a_cost_agree() -> None:
+    by_nodes = pg.costs.expected_by_nodes(pg.costs.saturating(error, 1.0), D)
+    closed = pg.costs.expected_saturating(error, 1.0, ())
+    mean, cov = X, jnp.array([[0.1, 0.05], [0.05, 0.2]])
+    np.testing.assert_allclose(by_nodes(mean, cov), closed(mean, cov), atol=1e-3)
+
+
+@example(*(f"dropouts.{name}" for name in pg.dropouts.__all__))
+def _() -> Any:
+    kinds = [getattr(pg.dropouts, name)() for name in pg.dropouts.__all__]
+    return [kind.mask(kind.init(key(), 3), kind.sample(key(), 3)) for kind in kinds]
+
+
+@example(*(f"data.{name}" for name in pg.data.__all__))
+def _() -> Any:
+    rows = pg.data.minibatch(key(), pg.data.grow(experience(), 3 * H), 6)
+    assert isinstance(rows, pg.Batch)
+    assert rows.y.shape == (6, D)
+    return rows
+
+
+@example(*(f"gaussian.{name}" for name in pg.gaussian.__all__ if name != "Image"))
+def _() -> Any:
+    features = partial(pg.gaussian.sincos, angles=(0,))
+    control = pg.gaussian.chain(partial(pg.gaussian.affine, matrix=jnp.ones((U, D + 1))), pg.gaussian.squash)
+    change = partial(pg.gaussian.affine, matrix=jnp.ones((D, D + 1 + U)))
+    step = pg.gaussian.residual(pg.gaussian.chain(features, pg.gaussian.joint(control), change))
+    after = step(X, 0.1 * jnp.eye(D))
+    assert isinstance(after, pg.gaussian.Image)
+    assert after.cov.shape == (D, D)
+    return after
+
+
+@example(*(f"angles.{name}" for name in pg.angles.__all__ if name != "feature_names"))
+def _() -> Any:
+    x = jnp.array([3.5, 1.0])
+    return pg.angles.encode(x, (0,)), pg.angles.wrap(x), pg.angles.difference(x, -x, (0,))
+
+
+@example("angles.feature_names")
+def _() -> Any:
+    assert len(pg.angles.feature_names(("angle", "rate"), (0,))) == 3
+
+
+@example("tasks.make", "tasks.of_config")
+def _() -> Any:
+    made, configured = pg.tasks.make("cartpole"), pg.tasks.of_config(CONFIG)
+    assert made.state_names == configured.state_names
+    with pytest.raises(pg.SettingError, match="did you mean 'cartpole'"):
+        pg.tasks.make("cartpol")
+    return made.cost(jnp.zeros(4))
+
+
+def public(module: ModuleType = pg, prefix: str = "") -> dict[str, Any]:
+    """Every public name, those of a family with a dot, and what it is."""
+    found: dict[str, Any] = {}
+    for name in module.__all__:
+        value = getattr(module, name)
+        family = inspect.ismodule(value) and hasattr(value, "__all__")
+        found |= public(value, f"{name}.") if family else {prefix + name: value}
+    return found
+
+
+PUBLIC = public()
+FUNCTIONS = {name: value for name, value in PUBLIC.items() if inspect.isfunction(inspect.unwrap(value))}
+
+
+@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - {"controller"}))
+def test_an_exported_function_is_called_with_exported_names(name: str) -> None:
+    assert name in EXAMPLES, f"{name} is exported and has no example here"
+    found = EXAMPLES[name]() if name in IMPURE else _jitted(EXAMPLES[name])
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(found) if leaf.dtype.kind == "f")
+
+
+_done: dict[Callable[[], Any], Any] = {}
+
+
+def _jitted(function: Callable[[], Any]) -> Any:
+    """What the example returns under jit; of several names that share it, computed once."""
+    if function not in _done:
+        # JAX's check of keys mistakes vmapped episodes of a plant for a second use.
+        _done[function] = (unchecked if function is EXAMPLES["run"] else lambda f: f)(jax.jit(function))()
+    return _done[function]
+
+
+def test_every_example_is_of_an_exported_name() -> None:
+    assert EXAMPLES.keys() == FUNCTIONS.keys()
+
+
+# Types
+
+
+def named(annotation: Any) -> Iterator[type]:
+    """The package's classes in an annotation, inside unions, tuples and callables too."""
+    parts = [part for argument in typing.get_args(annotation) for part in _each(argument)]
+    if parts:
+        for part in parts:
+            yield from named(part)
+    elif inspect.isclass(annotation) and annotation.__module__.startswith("pegasus"):
+        yield annotation
+
+
+def _each(argument: Any) -> list[Any]:
+    return argument if isinstance(argument, list) else [argument]
+
+
+def missing(value: Any) -> set[str]:
+    """The classes in the annotations of a function, or of a class's fields, that are not exported."""
+    classes = [c for c in PUBLIC.values() if inspect.isclass(c)]
+    classes += [c for c in vars(pg.config).values() if inspect.isclass(c)]
+    hints = typing.get_type_hints(inspect.unwrap(value))
+    return {c.__qualname__ for hint in hints.values() for c in named(hint) if c not in classes}
+
+
+@pytest.mark.parametrize("name", sorted(n for n, v in PUBLIC.items() if callable(v)))
+def test_what_a_signature_names_is_exported(name: str) -> None:
+    assert not missing(PUBLIC[name])
+
+
+def test_a_private_type_in_a_signature_is_found() -> None:
+    from pegasus_jax.models.bnn import Belief
+
+    def leaks(belief: Belief | None, many: Callable[[tuple[Belief, int]], pg.Batch]) -> pg.Rollout: ...
+
+    assert missing(leaks) == {"Belief"}
+
+
+def test_names_are_complete_and_others_are_refused() -> None:
+    assert pg.__all__ == sorted(set(pg.__all__))
+    assert {*dir(pg)} == {*pg.__all__, "__version__"}
+    assert pg.__version__.count(".") == 2
+    with pytest.raises(AttributeError, match="no attribute rolout"):
+        pg.rolout  # noqa: B018
+
+
+def test_the_page_of_public_names_is_complete() -> None:
+    page = (Path(__file__).resolve().parents[1] / "docs" / "design.md").read_text()
+    table = page.split("## Public names")[1].split("\n* ")[0].split("|---|")[1]
+    assert sorted(re.findall(r"`(\w+)`", table)) == pg.__all__
+
+
+# Shapes at the seams
+
+SCENARIOS = [
+    ("start", lambda s: s.start[0], r"scenarios\.start has shape \(2,\); expected \[K, D\]"),
+    ("start", lambda s: s.start.astype(int), r"scenarios\.start is of int32; expected floating-point"),
+    ("sensor", lambda s: s.sensor[:-1], r"scenarios\.sensor has shape \(3, 5, 2\); expected \[H, K, D\] \(4, 5, 2\)"),
+    ("match", lambda s: s.match[:, :-1], r"scenarios\.match has shape \(4, 4, 2\); expected \[H, K, D\] \(4, 5, 2\)"),
+    ("dynamics", lambda s: jax.tree.map(lambda leaf: leaf[:-1], s.dynamics), r"scenarios\.dynamics.* K = 5 particles"),
+    ("policy", lambda s: jnp.zeros((3, 1)), r"scenarios\.policy has shape \(3, 1\); expected \[K, \.\.\.\] with K = 5"),
+]
+
+
+@pytest.mark.parametrize(("part", "change", "message"), SCENARIOS)
+def test_a_rollout_names_the_part_of_the_scenarios_that_is_wrong(part: str, change: Any, message: str) -> None:
+    given = imagined()
+    wrong = given.scenarios._replace(**{part: change(given.scenarios)})
+    with pytest.raises(ValueError, match=f"^{message}"):
+        jax.eval_shape(partial(pg.rollout, **PIECES), given.params, given.belief, wrong)
+
+
+PIECES_THAT_ARE_WRONG = [
+    ("policy", POLICY._replace(apply=lambda params, noise, x: x[0]), r"what policy\.apply returns .*\[K, U\]"),
+    (
+        "dynamics",
+        DYNAMICS._replace(apply=lambda *_: pg.Prediction(jnp.zeros(3), jnp.ones(D)), particles=None),
+        r"mean of what dynamics\.apply returns for K particles has shape \(5, 3\); expected \[K, D\] \(5, 2\)",
+    ),
+    ("cost", pg.costs.of_particles(lambda x: x), r"the cost of one state has shape \(2,\); expected \(\)"),
+    ("cost", pg.costs.of_particles(lambda x: x[0] > 1), r"the cost of one state is of bool; expected floating-point"),
+]
+
+
+@pytest.mark.parametrize(("piece", "wrong", "message"), PIECES_THAT_ARE_WRONG)
+def test_a_piece_of_your_own_that_answers_wrongly_is_named(piece: str, wrong: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{message}"):
+        jax.eval_shape(partial(J, **{piece: wrong}), *imagined())
+
+
+def test_a_learner_is_no_parameters() -> None:
+    params, *rest = imagined()
+    with pytest.raises(ValueError, match=r"policy_params is a Learner; .*policy_params=learner\.params"):
+        jax.eval_shape(partial(pg.rollout, **PIECES), pg.Learner(params, ()), *rest)
+
+
+def test_an_episode_names_what_is_wrong_with_it() -> None:
+    experiment = pg.compose(CONFIG, TASK)
+    state, good = experiment.init(key()), trajectory()
+    with pytest.raises(ValueError, match=r"an episode's u has shape \(4, 2\); expected \(4, 1\)"):
+        experiment.absorb(state, good._replace(u=jnp.zeros((H, 2))))
+    with pytest.raises(ValueError, match=r"an episode's x is of int32"):
+        experiment.absorb(state, good._replace(x=jnp.zeros((H + 1, D), int)))
+
+
+def test_a_policy_that_answers_wrongly_is_named_before_the_plant_moves() -> None:
+    wrong = POLICY._replace(apply=lambda params, noise, x: x)
+    experiment = pg.compose(CONFIG, TASK, policy=wrong)
+    state = experiment.init(key())
+    with pytest.raises(ValueError, match=r"what policy\.apply returns has shape \(2,\); expected \[U\] \(1,\)"):
+        jax.eval_shape(experiment.collect, state)
+
+
+def test_a_function_is_no_cost() -> None:
+    with pytest.raises(pg.SettingError, match=r"is no Cost; .*Cost\(function\)"):
+        pg.compose(CONFIG, TASK, cost=lambda x: x)  # type: ignore[arg-type]
+
+
+# What is imported when
+
+APPLICATIONS = {"gymnasium", "imageio", "matplotlib", "mujoco", "orbax", "scipy", "tensorboardX"}
+
+
+@pytest.mark.parametrize(
+    ("code", "absent", "present"),
+    [
+        ("", APPLICATIONS | {"jax", "numpy", "omegaconf", "rich"}, set()),
+        ("pg.rollout", APPLICATIONS | {"omegaconf", "rich"}, {"jax"}),
+        ("[getattr(pg, n) for n in pg.__all__ if n.lower() != 'controller']", APPLICATIONS | {"omegaconf"}, {"flax"}),
+        ("pg.tasks.make('cartpole')", APPLICATIONS - {"gymnasium", "mujoco", "scipy"} | {"omegaconf"}, {"mujoco"}),
+    ],
+)
+def test_a_name_imports_what_it_needs_and_no_more(code: str, absent: set[str], present: set[str]) -> None:
+    assert not absent & loaded(f"import pegasus_jax as pg\n{code}")
+    assert present <= loaded(f"import pegasus_jax as pg\n{code}")
+
+
+def test_a_refused_command_waits_for_no_array_library() -> None:
+    refused = "from pegasus_jax.cli import train\ntry: train.train(['serach.steps=5'])\nexcept ValueError: pass"
+    found = loaded(refused)
+    assert "pegasus_jax" in found
+    assert not found & (APPLICATIONS | {"jax", "numpy", "flax", "optax"})
+
+
+def loaded(code: str) -> set[str]:
+    """The top-level modules that a program has imported when it ends."""
+    code += "\nimport sys; print(*{name.partition('.')[0] for name in sys.modules})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return set(done.stdout.split())
