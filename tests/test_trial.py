@@ -233,8 +233,10 @@ def test_no_two_purposes_trials_or_iterations_share_a_key():
     exp = compose(
         config,
         task._replace(plant=task.plant._replace(reset=noted(task.plant.reset))),
-        dynamics._replace(init=noted(dynamics.init), loss=noted(dynamics.loss, 1), sample=noted(dynamics.sample)),
-        policy._replace(init=noted(policy.init), sample=noted(policy.sample)),
+        dynamics=dynamics._replace(
+            init=noted(dynamics.init), loss=noted(dynamics.loss, 1), sample=noted(dynamics.sample)
+        ),
+        policy=policy._replace(init=noted(policy.init), sample=noted(policy.sample)),
     )
     unchecked(jax.jit(run(exp, 2, 3)))(jax.random.key(0))
     jax.effects_barrier()

@@ -46,19 +46,19 @@ def of_plant(name: str, plant: "Plant") -> Task:
     )
 
 
-def _cartpole(_: int) -> "Plant":
+def _cartpole(_: Any) -> "Plant":
     from pegasus_envs.cartpole import cartpole
 
     return cartpole()
 
 
-def _double_cartpole(_: int) -> "Plant":
+def _double_cartpole(_: Any) -> "Plant":
     from pegasus_envs.double_cartpole import double_cartpole
 
     return double_cartpole()
 
 
-def _swimmer(manoeuvre: str, legs: int) -> "Plant":
+def _swimmer(manoeuvre: str, legs: Any) -> "Plant":
     from pegasus_envs.swimmer.plant import swimmer
 
     return swimmer(manoeuvre, legs)
