@@ -63,7 +63,7 @@ def test_wheel_has_the_commands(wheel: zipfile.ZipFile) -> None:
     (path,) = (name for name in wheel.namelist() if name.endswith("entry_points.txt"))
     text = wheel.read(path).decode()
     for command in ("pegasus-train", "pegasus-eval", "pegasus-plot", "pegasus-play", "pegasus-figures"):
-        assert f"{command} = pegasus_jax.cli:" in text
+        assert f"{command} = pegasus_jax.cli.main:" in text
 
 
 def test_lock_names_no_host_and_no_path() -> None:

@@ -58,7 +58,7 @@ def _double_cartpole(_: Any) -> "Plant":
     return double_cartpole()
 
 
-def _swimmer(manoeuvre: str, legs: Any) -> "Plant":
+def _swimmer(manoeuvre: Any, legs: Any) -> "Plant":
     from pegasus_envs.swimmer.plant import swimmer
 
     return swimmer(manoeuvre, legs)
