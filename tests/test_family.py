@@ -22,8 +22,6 @@ UPRIGHT = np.array([0, 0, 0, np.pi])
 SMALL = {
     "model.hidden": "[8]",
     "model.members": "2",
-    "model.features": "6",
-    "model.points": "4",
     "model.substeps": "1",
     "policy.hidden": "[8]",
     "policy.units": "5",

@@ -16,6 +16,7 @@ from pegasus_jax.checks import SettingError, called, nearest, shown
 from pegasus_jax.config import Config
 from pegasus_jax.defaults import BEST, NAMES, defaults
 from pegasus_jax.runs.files import write_whole
+from pegasus_jax.runs.removed import refuse, without
 from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 
 # Keys that select a named variant, and what they select from.
@@ -63,6 +64,7 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
         config = override(config, {key: value for key, value in changes.items() if key in there})
     known, of_some = leaves(config), used_by()
     for key in words:
+        refuse(key)
         if key not in known:
             raise SettingError(f"{key} is not a setting; {_hint(key, [*known, *VARIANTS, *options])}")
         if task not in of_some.get(key, (task,)):
@@ -102,6 +104,11 @@ def values(words: dict[str, str]) -> dict[str, Any]:
 
 def override(config: Config, changes: dict[str, Any]) -> Config:
     """The config with dotted settings changed, all at once; each value becomes its setting's type, or is refused."""
+    known = leaves(config)
+    for key in changes:
+        refuse(key)
+        if key not in known:
+            raise SettingError(f"{key} is not a setting; {_hint(key, [*known])}")
     return _changed(config, changes, "")
 
 
@@ -156,6 +163,10 @@ def load(path: Path) -> Config:
         if kind not in (None, *KINDS[section]):
             raise SettingError(f"{path}: {section}.kind={kind} is unknown; {nearest(kind, KINDS[section])}")
     config = Config(**{section: KINDS[section][kind] for section, kind in chosen.items() if kind is not None})
+    try:
+        stored = without(stored)
+    except SettingError as error:
+        raise SettingError(f"{path}: {error}") from error
     wrong = sorted(set(map(str, stored)) - set(leaves(config)))
     if wrong:
         raise SettingError(f"{path} is not the config of a run of this version: see {', '.join(wrong[:5])}")
