@@ -29,9 +29,9 @@ from pegasus_jax.models.network import INITIALISERS
 from pegasus_jax.pilco.gp import gp
 from pegasus_jax.pilco.ssgp import ssgp
 from pegasus_jax.policies.squash import SQUASHES
+from pegasus_jax.presets import ALGORITHMS, MODELS, POLICIES
 from pegasus_jax.runs import config_io
 from pegasus_jax.types import Learner
-from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
 from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, same, tiny
 
 
@@ -46,16 +46,16 @@ def test_the_choices_of_a_config_are_the_pieces_there_are():
 @pytest.mark.parametrize("kind", DROPOUTS)
 def test_every_dropout_is_the_one_of_its_name(kind):
     """By its parameters and its mean; an unknown name must not fall through to no noise."""
-    noise = dropout_of(config.BNN(dropout=kind, rate=0.3, low=-4.0, high=0.5))
+    noise = dropout_of(config.BNN(dropout=kind, low=-4.0))
     params = noise.init(jax.random.key(0), 5)
     names = dict(log_normal={"location", "scale"}, concrete={"logit"}, gaussian={"logit"}, sparse={"position"})
     assert set(params) == names.get(kind, set())
     mean = np.asarray(noise.retain(params))
     if kind in ("binary", "concrete"):
-        np.testing.assert_allclose(mean, 0.7, atol=0.01)  # the rate is the one given
+        np.testing.assert_allclose(mean, 0.9, atol=0.01)
     if kind == "log_normal":
-        tall = noise.mask({name: jnp.full(5, 50.0) for name in params}, jnp.full(5, 0.999999))
-        np.testing.assert_allclose(tall, np.exp(0.5), rtol=1e-3)  # and so is the interval
+        short = noise.mask({name: jnp.full(5, -50.0) for name in params}, jnp.full(5, 1e-6))
+        np.testing.assert_allclose(short, np.exp(-4), rtol=1e-2)  # the interval is the one given
 
 
 @pytest.mark.parametrize("model", MODELS)

@@ -47,8 +47,6 @@ IMPOSSIBLE = [
     (BNN, dict(hidden=(50, 0)), "model.hidden=0"),
     (BNN, dict(dropout="lognormal"), "'log_normal'"),
     (BNN, dict(initialiser="glorrot"), "'glorot'"),
-    (BNN, dict(rate=1.0), "the nearest is 0.99"),
-    (BNN, dict(rate=-0.1), "the nearest is 0"),
     (BNN, dict(weight_decay=-1.0), "model.weight_decay=-1"),
     (BNN, dict(low=0.0), "model.low=0"),
     (BNN, dict(low=-math.inf), "model.low=-inf"),
@@ -116,8 +114,7 @@ def test_numbers_of_numpy_become_pythons_own():
 
 
 def test_limits_themselves_are_possible():
-    BNN(rate=0.0, weight_decay=0.0)
-    BNN(rate=0.99, hidden=(1,))
+    BNN(weight_decay=0.0, hidden=(1,))
     MLP(dropout=0.0)
     Fit(steps=1, batch=1, learning_rate=1e-12)
     Search(steps=1, particles=2, clip=None)

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from pegasus_jax import config, config_models
 from pegasus_jax.checks import SettingError, shown
 from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
+from pegasus_jax.presets import ALGORITHMS
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.removed import REMOVED
 from pegasus_jax.tasks import TASKS
-from pegasus_jax.variants import ALGORITHMS
 from test_settings import parse
 
 positive = st.floats(1e-6, 1e3)
@@ -30,7 +30,6 @@ configs = st.builds(
         low=st.floats(-20, -0.1),
         hidden=layers,
         dropout=st.sampled_from(config_models.DROPOUTS),
-        rate=st.floats(0, 0.99),
         heteroscedastic=st.booleans(),
         weight_decay=st.floats(0, 10),
         initialiser=st.sampled_from(config.INITIALISERS),

@@ -8,10 +8,8 @@ from hypothesis import strategies as st
 
 from pegasus_jax.builder import compose
 from pegasus_jax.checks import SettingError, shown
-from pegasus_jax.config import BNN, RBF, Analytic, Config, Lagrangian, Period, Search
-from pegasus_jax.defaults import defaults
+from pegasus_jax.config import BNN, KINDS, RBF, Analytic, Config, Lagrangian, Period, Search
 from pegasus_jax.runs import config_io
-from pegasus_jax.variants import KINDS, MODELS, POLICIES
 from probes import cart
 
 
@@ -48,7 +46,7 @@ SPELLINGS = [
     ("model.dropout=log_normal", "model.dropout", "log_normal"),
     ("model.dropout=binary", "model.dropout", "binary"),
     ("model.dropout=none", "model.dropout", "none"),
-    ("model.rate=.2", "model.rate", 0.2),
+    ("model.kl_weight=.2", "model.kl_weight", 0.2),
     ("model.low=-4", "model.low", -4.0),
     ("model.heteroscedastic=false", "model.heteroscedastic", False),
     ("policy.dropout=.1", "policy.dropout", 0.1),
@@ -125,21 +123,6 @@ def test_every_setting_has_a_spelling():
             assert f"  {key}={shown(default)} " in text
 
 
-VARIANTS = [
-    *((f"model={name}", variant) for name, variant in MODELS.items()),
-    *((f"policy={name}", variant) for name, variant in POLICIES.items()),
-]
-
-
-@pytest.mark.parametrize(("word", "variant"), VARIANTS)
-def test_a_variant_is_what_it_changes(word, variant):
-    sections = {name: change for name, change in variant.items() if "." not in name}
-    chosen = dataclasses.replace(Config(), **sections)
-    settled = {name: change for name, change in (defaults("cartpole") | variant).items() if "." in name}
-    there = {name: change for name, change in settled.items() if name in config_io.leaves(chosen)}
-    assert parse(word) == config_io.override(chosen, there)
-
-
 def test_the_task_changes_only_what_the_chosen_variant_has():
     """The double cart-pole's networks are deeper; so are an ensemble's, and its members stay."""
     chosen = parse("task=double_cartpole", "model=ensemble")
@@ -168,10 +151,10 @@ def test_a_stored_kind_that_is_unknown_is_named(section, tmp_path):
 
 def test_a_variant_brings_defaults_that_single_settings_change():
     """In any order on the line."""
-    words = "model=binary", "algorithm=deep_pilco", "search.clip=1", "model.rate=.3", "search.period.match=0"
+    words = "model=binary", "algorithm=deep_pilco", "search.clip=1", "model.weight_decay=.3", "search.period.match=0"
     for order in (words, words[::-1]):
         chosen = parse(*order)
-        assert chosen.model == BNN(dropout="binary", rate=0.3, activation="relu", kl_weight=1.0)
+        assert chosen.model == BNN(dropout="binary", weight_decay=0.3, activation="relu", kl_weight=1.0)
         plain = Search(cost="particles", widen=1.0, particles=10, clip=1.0, restart=False)
         assert chosen.search == dataclasses.replace(plain, period=Period(1, 1, 1, 1, 0))
 
@@ -241,7 +224,7 @@ WRONG = [
     (["trials=[3]"], ["is not a whole number"]),
     (["trials=true"], ["trials=true is not a whole number"]),
     (["fit.learning_rate=fast"], ["fit.learning_rate=fast is not a number"]),
-    (["model.rate={a: 1}"], ["model.rate=", "is not a number"]),
+    (["model.kl_weight={a: 1}"], ["model.kl_weight=", "is not a number"]),
     (["search.clip=none"], ["search.clip=none is not a number or null"]),
     (["search.reset=maybe"], ["search.reset=maybe is not true or false"]),
     (["policy.hidden=50"], ["policy.hidden=50 is not a list of whole numbers", "for example policy.hidden=[200,200]"]),
@@ -335,7 +318,9 @@ NESTED = ["[1,[2]]", "{a: {b: 1}}", "{a: 1}", "[]", "{}", "[null]", "[true]", "?
 NESTED += ["2026-01-01", "0x10", "1_0", "first\nsecond"]
 
 
-@pytest.mark.parametrize("key", ["seed", "model.hidden", "model.dropout", "model.rate", "search.clip", "search.reset"])
+@pytest.mark.parametrize(
+    "key", ["seed", "model.hidden", "model.dropout", "model.kl_weight", "search.clip", "search.reset"]
+)
 @pytest.mark.parametrize("text", NESTED)
 def test_any_yaml_ends_in_a_config_or_in_one_line(key, text):
     end = fate(f"{key}={text}")
@@ -346,7 +331,6 @@ def test_any_yaml_ends_in_a_config_or_in_one_line(key, text):
 
 TOGETHER = [
     ["model.low=-.01"],  # narrower than the least scale of its noise
-    ["model=concrete", "model.rate=0"],
     ["search.particles=2"],
     ["search.particles=2", "search.match=false", "search.balanced=true"],
     ["policy=rbf", "algorithm=pilco"],

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pegasus_jax.imagine.scenarios import draw
     from pegasus_jax.learn.fit import fit
     from pegasus_jax.learn.search import objective, optimise
+    from pegasus_jax.presets import preset
     from pegasus_jax.runs.controller import controller
 
 _MODULES = {
@@ -26,6 +27,7 @@ _MODULES = {
     "fit": "learn.fit",
     "objective": "learn.search",
     "optimise": "learn.search",
+    "preset": "presets",
     "rollout": "imagine.rollout",
     "run": "experiment",
     "tasks": "tasks",
@@ -40,6 +42,7 @@ __all__ = [
     "fit",
     "objective",
     "optimise",
+    "preset",
     "rollout",
     "run",
     "tasks",

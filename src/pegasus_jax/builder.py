@@ -55,8 +55,8 @@ from pegasus_jax.types import (
 AGGREGATES = {"mean": cost.mean, "total": cost.total}
 NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
     "log_normal": lambda config: dropout.log_normal(config.low),
-    "binary": lambda config: dropout.binary(config.rate),
-    "concrete": lambda config: dropout.concrete(config.rate),
+    "binary": lambda _: dropout.binary(),
+    "concrete": lambda _: dropout.concrete(),
     "gaussian": lambda _: dropout.gaussian(),
     "sparse": lambda _: dropout.sparse(),
     "none": lambda _: dropout.none(),

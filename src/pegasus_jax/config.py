@@ -5,13 +5,18 @@ Values are checked when a config is made; a bad one raises `SettingError`, which
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from pegasus_jax import checks
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config_models import BNN, GP, INITIALISERS, SSGP, Lagrangian, setting
 
-GYM, MJCF = ("gym",), ("mjcf",)
-OWN = (*GYM, *MJCF)
+MANOEUVRES = ("knife_edge", "belly_up", "corkscrew", "depth_change")
+GYM = "gym"  # the task that `env=` and `cost=` describe
+MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe
+TASKS = ("cartpole", "double_cartpole", *(f"swimmer_{manoeuvre}" for manoeuvre in MANOEUVRES), GYM, MJCF)
+OWN = (GYM, MJCF)
 
 SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
@@ -243,21 +248,23 @@ class Config:
 
     task: str = setting("cartpole", "what to learn")
     legs: int = setting(2, "that the swimmer drives: 2 or 6", ("swimmer_*",))
-    env: str | None = setting(None, "the environment's Gymnasium id", GYM)
-    mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", MJCF)
+    env: str | None = setting(None, "the environment's Gymnasium id", (GYM,))
+    mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", (MJCF,))
     cost: str | None = setting(None, "module:function, observation [D] -> cost in [0, 1], in JAX", OWN)
     angles: tuple[int, ...] = setting((), "the entries of the observation that are angles [rad]", OWN)
-    rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", GYM)
+    rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", (GYM,))
     horizon: int | None = setting(None, "control periods an episode; null: a gym's own limit, or 100", OWN)
     dt: float | None = setting(
         None, "control period [s]; null: a gym's own. A whole number of an mjcf's time steps", OWN
     )
-    env_args: tuple[str, ...] = setting((), "the environment's own arguments, each as env_args.port=/dev/ttyACM0", GYM)
+    env_args: tuple[str, ...] = setting(
+        (), "the environment's own arguments, each as env_args.port=/dev/ttyACM0", (GYM,)
+    )
     stop: str | None = setting(
         None, "module:function, observation [D] -> probability that an episode ends there, in JAX", OWN
     )
     stop_cost: float = setting(1.0, "of each control period that an early end leaves out", OWN)
-    observe: tuple[str, ...] = setting((), "as [qpos.0,qvel.1]; []: all positions, then all velocities", MJCF)
+    observe: tuple[str, ...] = setting((), "as [qpos.0,qvel.1]; []: all positions, then all velocities", (MJCF,))
     control_low: tuple[float, ...] = setting((), "least controls; []: the action space's, the file's ctrlrange", OWN)
     control_high: tuple[float, ...] = setting(
         (), "greatest controls; []: the action space's, the file's ctrlrange", OWN
@@ -301,3 +308,20 @@ class Config:
         checks.sizes("", self, "trials")
         checks.sizes("", self, "evaluation", low=0)
         checks.rows(self.trials, self.horizon)
+
+
+# What each section can be, by the kind that a stored config names.
+KINDS: dict[str, dict[str, Any]] = {
+    "model": {"bnn": BNN(), "gp": GP(), "ssgp": SSGP(), "lagrangian": Lagrangian()},
+    "policy": {"mlp": MLP(), "rbf": RBF(), "linear": Linear()},
+    "fit": {"adam": Fit(), "lbfgs": LBFGS()},
+    "search": {"particles": Search(), "analytic": Analytic()},
+}
+
+
+def label(config: Config) -> str:
+    """The task with what tells it from others of its name, as part of a folder's name."""
+    if config.task.startswith("swimmer_"):
+        return f"{config.task}-legs{config.legs}"
+    own = {GYM: config.env, MJCF: Path(config.mjcf or "").stem}.get(config.task)
+    return f"{config.task}-{own}".replace("/", "-").replace(":", "-") if own else config.task

@@ -25,7 +25,6 @@ class _Network:
     members: int = setting(1, "networks fitted side by side; each particle follows one of them")
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
-    rate: float = setting(0.1, "drop probability of binary dropout, initial one of concrete dropout")
     low: float = setting(-10.0, "lower end of the interval of log z (log_normal), whose upper end is 0")
     kl_weight: float = setting(0.1, "factor of the noise's KL divergence; 1 is the variational bound")
     weight_decay: float = setting(1.0, "factor of the Gaussian prior on the weights")
@@ -40,7 +39,6 @@ class _Network:
         kinds = dict(activation=ACTIVATIONS, dropout=DROPOUTS, initialiser=INITIALISERS)
         for name, choices in kinds.items():
             checks.choice(f"model.{name}", getattr(self, name), choices)
-        checks.within("model.rate", self.rate, 0, 0.99)
         checks.least("model", self, 0, "kl_weight", "weight_decay")
         checks.within("model.low", self.low, -math.inf, 0, open_high=True)
 

@@ -13,7 +13,9 @@ class Removed(NamedTuple):
 
 
 REMOVED = {
+    "mjcf_digest": Removed(None, "run.json has it"),
     "model.high": Removed(0.0, "log z ends at 0; dropout.log_normal(low, high) in a model of your own"),
+    "model.rate": Removed(0.1, "binary(rate) or concrete(rate) of the dropout module in a model of your own"),
     "model.head": Removed("sigmoid", "bnn(head=HEADS['softplus']) as a model of your own"),
     "model.input_noise": Removed(False, "model.dropout= is noise on the hidden units"),
     "model.whitening": Removed("full", "inputs and targets are scaled with their full covariance"),

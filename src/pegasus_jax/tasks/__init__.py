@@ -20,8 +20,7 @@ from pegasus_envs.render import frames, unstack
 from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax import interrupt
 from pegasus_jax.checks import SettingError, nearest
-from pegasus_jax.config import Config
-from pegasus_jax.defaults import GYM, MANOEUVRES, MJCF
+from pegasus_jax.config import GYM, MANOEUVRES, MJCF, Config
 from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
 from pegasus_jax.tasks import user_code
 from pegasus_jax.types import Task
