@@ -19,7 +19,6 @@ from pegasus_jax.learn import data as dataset
 from pegasus_jax.math import angles
 from pegasus_jax.models import dropout
 from pegasus_jax.models.bnn import bnn
-from pegasus_jax.models.noisy import HEADS
 from pegasus_jax.policies.mlp import mlp
 from pegasus_jax.policies.squash import SQUASHES, to_limits
 from pegasus_jax.types import Dynamics, Policy, Prediction, Task, Trajectory
@@ -121,8 +120,8 @@ class Counter:
 def tiny(**changes: Any) -> config.Config:
     """A config that learns a probe in seconds; dotted changes with __ for the dot."""
     sections = {
-        "model": dict(hidden=(16, 16), dropout="none", head="softplus", weight_decay=0.1),
-        "policy": dict(hidden=(16,), dropout=0.1, output_scale=0.3),
+        "model": dict(hidden=(16, 16), dropout="none", weight_decay=0.1),
+        "policy": dict(hidden=(16,), dropout=0.1),
         "fit": dict(steps=400, batch=32, learning_rate=1e-2),
         "search": dict(steps=60, particles=12, learning_rate=2e-2),
         "explore": dict(trials=1),
@@ -277,10 +276,7 @@ def network(kind: str = "log_normal", heteroscedastic: bool = True, **changes: A
         angles=(2,),
         hidden=(8,),
         dropout=noise,
-        input_dropout=None,
-        head=HEADS["sigmoid"],
         heteroscedastic=heteroscedastic,
-        full_whitening=True,
         weight_decay=1.0,
         initialiser="glorot",
     )

@@ -19,10 +19,9 @@ from probes import experience, network
 BATCH = Batch(*(rows[:6] for rows in experience()[:3]))
 
 
-def whitening(rows, full=True):
+def whitening(rows):
     """Mean and root of rows in float64."""
-    cov = np.cov(rows.astype(np.float64).T, bias=True)
-    return rows.mean(0), np.linalg.cholesky(cov) if full else np.diag(np.sqrt(np.diag(cov)))
+    return rows.mean(0), np.linalg.cholesky(np.cov(rows.astype(np.float64).T, bias=True))
 
 
 def log_normal_kl(params):
@@ -36,17 +35,17 @@ def log_normal_kl(params):
 
 
 @pytest.mark.parametrize(
-    ("kind", "heteroscedastic", "full"),
-    [("none", True, True), ("none", False, False), ("log_normal", True, True)],
+    ("kind", "heteroscedastic"),
+    [("none", True), ("none", False), ("log_normal", True)],
 )
-def test_the_loss_is_eq_2_over_n(kind, heteroscedastic, full):
+def test_the_loss_is_eq_2_over_n(kind, heteroscedastic):
     """-log likelihood a row without its 2 pi, plus KL and half the squared weights, over the rows of the data set.
 
     Log-normal noise is switched off by setting its location and scale where it is all but 1, so that NumPy need not
     know the base draws; its KL is then far from zero.
     """
     data = experience()
-    model = network(kind, heteroscedastic, full_whitening=full, weight_decay=3.0, head=HEADS["softplus"])
+    model = network(kind, heteroscedastic, weight_decay=3.0, head=HEADS["softplus"])
     params = jax.jit(model.init)(jax.random.key(0))
     if kind == "log_normal":
         params["noise"] = ({}, {"location": jnp.full(8, 12.0), "scale": jnp.full(8, -30.0)})
@@ -55,8 +54,8 @@ def test_the_loss_is_eq_2_over_n(kind, heteroscedastic, full):
     size = int(data.size)
     rows = np.asarray(data.x)[:size], np.asarray(data.u)[:size], np.asarray(data.y)[:size]
     inputs = lambda x, u: np.concatenate([x[:, :2], np.sin(x[:, 2:]), np.cos(x[:, 2:]), u], 1)  # noqa: E731
-    mean_in, root_in = whitening(inputs(rows[0], rows[1]), full)
-    mean_out, root_out = whitening(rows[2], full)
+    mean_in, root_in = whitening(inputs(rows[0], rows[1]))
+    mean_out, root_out = whitening(rows[2])
     layers = [jax.tree.map(np.asarray, params["network"]["params"][f"layer_{i}"]) for i in range(2)]
     white = np.linalg.solve(root_in, (inputs(*(np.asarray(r) for r in BATCH[:2])) - mean_in).T).T
     mask = 1.0
@@ -114,20 +113,7 @@ def test_a_draw_is_one_deterministic_function_and_draws_differ(kind):
     assert np.array_equal(means[0], again)
     different = len(np.unique(means[0], axis=0))
     assert different == 1 if kind == "none" else different > 3  # a dropped unit may have been silent anyway
-    assert draws[0] is None  # no noise on the inputs unless asked for
-
-
-def test_input_noise_masks_the_inputs_too():
-    model = network("binary", input_dropout=dropout.binary(0.5))
-    belief = model.condition(jax.jit(model.init)(jax.random.key(0)), experience())
-    draw = model.sample(jax.random.key(1), belief)
-    assert draw[0].shape == (6,)
-    silent = [jnp.zeros(6), jnp.ones(8)]
-    first, second = (model.apply(belief, silent, x, u).mean for x, u in zip(BATCH.x[:2], BATCH.u[:2], strict=True))
-    assert np.array_equal(first, second)  # with every input dropped, nothing depends on the state
-    assert not np.array_equal(
-        *(model.apply(belief, [jnp.ones(6), jnp.ones(8)], x, BATCH.u[0]).mean for x in BATCH.x[:2])
-    )
+    assert draws[0] is None  # no noise on the inputs
 
 
 def test_angles_enter_by_sine_and_cosine():
@@ -165,10 +151,8 @@ def learned(std, *, kind="none", head="softplus", heteroscedastic=True, steps=15
         angles=(),
         hidden=(32, 32),
         dropout=getattr(dropout, kind)(),
-        input_dropout=None,
         head=HEADS[head],
         heteroscedastic=heteroscedastic,
-        full_whitening=True,
         weight_decay=0.01,
         initialiser="glorot",
     )

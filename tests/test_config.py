@@ -28,16 +28,15 @@ def test_layers_given_as_a_list_are_still_hashable():
 def test_the_defaults_are_the_measured_ones():
     """docs/decisions: a change here changes every result. test_settings holds algorithm=paper to the paper."""
     c = Config()
-    assert (c.model.hidden, c.model.dropout, c.model.heteroscedastic, c.model.whitening) == (
+    assert (c.model.hidden, c.model.dropout, c.model.heteroscedastic) == (
         (200, 200),
         "log_normal",
         True,
-        "full",
     )
-    assert (c.policy.hidden, c.policy.dropout, c.policy.execution) == ((200, 200), 0.0, "sampled")
-    assert (c.fit.steps, c.fit.batch, c.fit.learning_rate, c.fit.reset) == (2000, 100, 3e-4, False)
+    assert (c.policy.hidden, c.policy.dropout) == ((200, 200), 0.0)
+    assert (c.fit.steps, c.fit.batch, c.fit.learning_rate) == (2000, 100, 3e-4)
     assert (c.search.steps, c.search.particles, c.search.learning_rate, c.search.clip) == (1000, 100, 1e-3, 1.0)
-    assert (c.search.match, c.search.aggregate, c.search.discount) == (True, "mean", 1.0)
+    assert (c.search.match, c.search.aggregate) == (True, "mean")
     assert c.search.period == Period(start=1, dynamics=100, policy=1, sensor=1, match=1)
     assert (c.model.activation, c.model.kl_weight, c.search.restart) == ("silu", 0.1, True)
     assert (c.search.cost, c.search.widen) == ("matched", 4.0)  # docs/decisions/0002
@@ -47,21 +46,14 @@ def test_the_defaults_are_the_measured_ones():
 IMPOSSIBLE = [
     (BNN, dict(hidden=(50, 0)), "model.hidden=0"),
     (BNN, dict(dropout="lognormal"), "'log_normal'"),
-    (BNN, dict(head="sigmoidal"), "'sigmoid'"),
-    (BNN, dict(whitening="Full"), "'full'"),
     (BNN, dict(initialiser="glorrot"), "'glorot'"),
-    (BNN, dict(rate=1.0), "the nearest is 0.99"),
-    (BNN, dict(rate=-0.1), "the nearest is 0"),
     (BNN, dict(weight_decay=-1.0), "model.weight_decay=-1"),
     (BNN, dict(low=0.0), "model.low=0"),
     (BNN, dict(low=-math.inf), "model.low=-inf"),
     (BNN, dict(low=math.nan), "model.low=nan"),
-    (BNN, dict(high=math.inf), "model.high=inf"),
     (MLP, dict(hidden=(-3,)), "policy.hidden=-3"),
     (MLP, dict(squash="tan"), "'tanh'"),
-    (MLP, dict(execution="average"), "sampled, mean"),
     (MLP, dict(dropout=1.0), "the nearest is 0.99"),
-    (MLP, dict(output_scale=0.0), "policy.output_scale=0"),
     (Fit, dict(steps=0), "the nearest is 1"),
     (Fit, dict(batch=0), "fit.batch=0"),
     (Fit, dict(learning_rate=0.0), "(0, inf)"),
@@ -72,7 +64,6 @@ IMPOSSIBLE = [
     (Search, dict(particles=1), "the nearest is 2"),
     (Search, dict(learning_rate=-1e-3), "search.learning_rate=-0.001"),
     (Search, dict(clip=0.0), "search.clip=0"),
-    (Search, dict(discount=1.01), "(0, 1]"),
     (Search, dict(anew=True), "search.refine=0.5; the nearest is false"),
     (Search, dict(anew=True, refine=0.5, restart=False), "search.restart=true"),
     (Search, dict(aggregate="sum"), "mean, total"),
@@ -123,11 +114,10 @@ def test_numbers_of_numpy_become_pythons_own():
 
 
 def test_limits_themselves_are_possible():
-    BNN(rate=0.0, weight_decay=0.0)
-    BNN(rate=0.99, hidden=(1,))
+    BNN(weight_decay=0.0, hidden=(1,))
     MLP(dropout=0.0)
     Fit(steps=1, batch=1, learning_rate=1e-12)
-    Search(steps=1, particles=2, clip=None, discount=1.0)
+    Search(steps=1, particles=2, clip=None)
     Explore(trials=0)
     Config(seed=2**32 - 1, trials=1)
 

@@ -48,37 +48,6 @@ def test_mean_and_total_differ_by_the_horizon():
     np.testing.assert_allclose(cost.total(COSTS), 6 * COSTS.mean(), rtol=1e-6)
 
 
-@given(st.floats(0.05, 1))
-def test_discount_weighs_each_step_against_the_one_before(discount):
-    expected = sum(discount**t * COSTS[t].mean() for t in range(6))
-    np.testing.assert_allclose(cost.discounted(discount, cost.total)(COSTS), expected, rtol=1e-5)
-    np.testing.assert_allclose(cost.discounted(discount, cost.mean)(COSTS), expected / 6, rtol=1e-5)
-
-
-def test_the_worst_particles_by_a_sort():
-    """Where the fraction is no whole number of particles, the last counts in part."""
-    episodes = COSTS.mean(0)
-    order = np.argsort(-episodes)
-    for fraction, weights in ((0.25, [1, 0, 0, 0]), (0.5, [1, 1, 0, 0]), (0.6, [1, 1, 0.4, 0]), (1.0, [1, 1, 1, 1])):
-        expected = np.sum(np.array(weights) * episodes[order]) / np.sum(weights)
-        np.testing.assert_allclose(cost.worst(fraction)(COSTS), expected, rtol=1e-6)
-        np.testing.assert_allclose(cost.worst(fraction, cost.total)(COSTS), 6 * expected, rtol=1e-6)
-
-
-def test_only_the_worst_particles_have_a_gradient():
-    gradient = np.asarray(jax.grad(cost.worst(0.5))(jnp.asarray(COSTS)))
-    worst = np.argsort(-COSTS.mean(0))[:2]
-    np.testing.assert_allclose(gradient[:, worst], 1 / 12, rtol=1e-6)
-    assert not np.any(np.delete(gradient, worst, 1))
-
-
-def test_the_worst_by_discounted_cost():
-    """The particle that is worst at first is not the one that is worst on the whole."""
-    costs = jnp.array([[1.0, 0.0], [0.0, 0.9], [0.0, 0.9]])
-    assert float(cost.worst(0.5, cost.total)(costs)) == pytest.approx(1.8)
-    assert float(cost.discounted(0.1, cost.worst(0.5, cost.total))(costs)) == pytest.approx(1.0)
-
-
 # Expected costs. Every task of the package has an error that is affine in the features
 
 PLANTS = {

@@ -9,10 +9,10 @@ import pytest
 
 from pegasus_jax.builder import compose, dynamics_of
 from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
+from pegasus_jax.presets import ALGORITHMS, MODELS, POLICIES
 from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import make
 from pegasus_jax.types import Trajectory
-from pegasus_jax.variants import ALGORITHMS, MODELS, POLICIES
 from probes import Counter, same, unchecked
 
 HORIZON, SEEDS = 3, 2
@@ -22,8 +22,6 @@ UPRIGHT = np.array([0, 0, 0, np.pi])
 SMALL = {
     "model.hidden": "[8]",
     "model.members": "2",
-    "model.features": "6",
-    "model.points": "4",
     "model.substeps": "1",
     "policy.hidden": "[8]",
     "policy.units": "5",

@@ -13,7 +13,6 @@ from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import fit
 from pegasus_jax.models import dropout
 from pegasus_jax.models.lagrangian import LEAST_MASS, Belief, Units, lagrangian, solve
-from pegasus_jax.models.noisy import HEADS
 from pegasus_jax.types import Learner, Trajectory
 
 SPEEDS = (2, 1)  # x is (cart, pole's speed, cart's speed, pole)
@@ -30,7 +29,6 @@ def mechanism(**changes):
         substeps=2,
         hidden=(8,),
         dropout=dropout.none(),
-        head=HEADS["sigmoid"],
         activation="silu",
     )
     return lagrangian(**{**pieces, **changes})

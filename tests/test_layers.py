@@ -17,7 +17,7 @@ LAYERS = {
     0: "types checks interrupt",
     1: "config_models shapes sharding math.",
     2: "config models. imagine. episode",
-    3: "defaults variants policies. learn.",
+    3: "presets policies. learn.",
     4: "tasks. pilco. experiment",
     5: "builder",
     6: "runs.",

@@ -11,7 +11,6 @@ from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 from pegasus_jax.models import _lagrangian_pallas as kernel
 from pegasus_jax.models import dropout
 from pegasus_jax.models.lagrangian import lagrangian
-from pegasus_jax.models.noisy import HEADS
 from pegasus_jax.types import Array, Dataset
 
 # x in the order of a user's, with angles and rates anywhere; widths that are no powers of two are filled up.
@@ -23,7 +22,7 @@ K = 21  # no whole number of blocks
 
 def pieces(case: dict, noise: dropout.Dropout, substeps: int) -> tuple:
     """(plain, fused, belief, masks, x, u) of random data in single precision."""
-    model = lagrangian(**case, dropout=noise, dt=0.1, substeps=substeps, head=HEADS["sigmoid"])
+    model = lagrangian(**case, dropout=noise, dt=0.1, substeps=substeps)
     d, c = case["states"], case["controls"]
     random = np.random.default_rng(0)
     x, u, y = (jnp.asarray(random.normal(size=(50, n)), jnp.float32) for n in (d, c, d))
@@ -73,7 +72,7 @@ def test_as_the_plain_form(case: dict, noise: dropout.Dropout, substeps: int) ->
 
 def test_a_model_takes_it_where_there_is_one_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     _, _, belief, masks, x, u = pieces(RELU, dropout.none(), 1)
-    model = lagrangian(**RELU, dropout=dropout.none(), dt=0.1, substeps=1, head=HEADS["sigmoid"])
+    model = lagrangian(**RELU, dropout=dropout.none(), dt=0.1, substeps=1)
     assert model.particles is not None
     expected, calls = jax.vmap(model.apply, (None, 0, 0, 0))(belief, masks, x, u), []
 

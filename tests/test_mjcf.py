@@ -17,8 +17,7 @@ from pegasus_envs import mjcf_check, mjcf_plant
 from pegasus_envs.render import frames
 from pegasus_jax import tasks
 from pegasus_jax.checks import SettingError
-from pegasus_jax.config import Config
-from pegasus_jax.defaults import label
+from pegasus_jax.config import Config, label
 from pegasus_jax.runs import config_io, store
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]

@@ -260,7 +260,7 @@ def test_the_gradient_equals_finite_differences():
     @jax.jit
     def value(params):
         return search.objective(
-            params, 1.0, (MEAN, COV), STD, horizon=4, expected_cost=expected, noise=NoiseUse(1.0, 0.5, 0.5), **PIECES
+            params, 1.0, (MEAN, COV), STD, horizon=4, expected_cost=expected, noise=NoiseUse(1.0, 0.5), **PIECES
         )
 
     params = jax.tree.map(jnp.asarray, policy_params())
@@ -299,7 +299,7 @@ def linear_recursion(plant, gain, std, noise):
     return np.array(means), np.array(covs)
 
 
-@pytest.mark.parametrize("noise", [NoiseUse(0.0), NoiseUse(1.0), NoiseUse(0.5, 0.7, 0.9)])
+@pytest.mark.parametrize("noise", [NoiseUse(0.0), NoiseUse(1.0), NoiseUse(0.5, 0.7)])
 @pytest.mark.parametrize("plant", [SCALAR, PENDULUM])
 def test_a_linear_plant_is_propagated_exactly(plant, noise):
     """And its noise enters where it is said to, from the second step on for the policy."""
@@ -322,8 +322,7 @@ def test_a_linear_plant_is_propagated_exactly(plant, noise):
         aggregate=costs.total,
         **pieces,
     )
-    seen = covs[1:] + np.diag((noise.cost * std) ** 2)
-    np.testing.assert_allclose(value, sum(map(spread, means[1:], seen)), rtol=1e-9)
+    np.testing.assert_allclose(value, sum(map(spread, means[1:], covs[1:])), rtol=1e-9)
 
 
 # The search

@@ -13,11 +13,11 @@ from pegasus_jax.imagine import matching
 from pegasus_jax.imagine.rollout import UNROLL, NoiseUse, limited, rollout
 from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.types import Dynamics, Period, Policy, Prediction, Scenarios
-from probes import PENDULUM, Linear, known, linear_policy, rig
+from probes import Linear, known, linear_policy, rig
 
 K, H, D = 7, 4, 3
 MATCHES = {"match": matching.match, "keep": matching.keep}
-NOISE = NoiseUse(policy=0.7, state=0.4, cost=0.5)
+NOISE = NoiseUse(policy=0.7, state=0.4)
 every_match = pytest.mark.parametrize("match", MATCHES)
 seeds = st.integers(0, 2**16)
 
@@ -175,16 +175,15 @@ def test_a_model_of_all_particles_at_once_is_taken_for_the_model_of_one():
     np.testing.assert_allclose(steps[0], steps[1][:, ::-1], atol=1e-5)
 
 
-@given(*[st.floats(0, 2, width=32)] * 3)
-def test_noise_factors_do_what_they_say(policy_factor, state_factor, cost_factor):
+@given(*[st.floats(0, 2, width=32)] * 2)
+def test_noise_factors_do_what_they_say(policy_factor, state_factor):
     """The controller repeats what it sees, the model stands still: each factor can be read off."""
     std = jnp.array([0.5, 2.0])
-    imagined = STILL(NoiseUse(policy_factor, state_factor, cost_factor), std)
+    imagined = STILL(NoiseUse(policy_factor, state_factor), std)
     blur = np.asarray(std * CONSTANT.sensor)
     np.testing.assert_allclose(imagined.u[0], imagined.x[0], atol=1e-6)  # the first state is seen as it is
     np.testing.assert_allclose(imagined.u[1:], imagined.x[1:-1] + policy_factor * blur[:-1], atol=1e-5)
     np.testing.assert_allclose(np.diff(imagined.x, axis=0), state_factor * blur, atol=1e-5)
-    np.testing.assert_allclose(imagined.seen, imagined.x[1:] + cost_factor * blur, atol=1e-5)
     assert np.array_equal(imagined.std, np.broadcast_to(std, (5, 3, 2)))
 
 
@@ -196,67 +195,25 @@ def STILL(noise, std):
 
 
 def test_the_default_is_the_authors_noise_on_the_policy_input_alone():
-    assert NoiseUse() == (1.0, 0.0, 0.0, None)
+    assert NoiseUse() == (1.0, 0.0, None)
 
 
-@pytest.mark.parametrize("factor", range(3))
+@pytest.mark.parametrize("factor", range(2))
 def test_no_gradient_flows_through_the_predicted_noise(factor):
     """A policy that could lower its cost by making the model sure of itself must not be told so."""
-    noise = NoiseUse(*(float(i == factor) for i in range(3)))
+    noise = NoiseUse(*(float(i == factor) for i in range(2)))
     policy = controller(lambda params, draw, x: jnp.stack([params, x[0]]))  # what the std depends on; what is seen
 
     def loss(params, through_mean):
         dynamics = model(lambda belief, draw, x, u: Prediction(through_mean * u[:1] * jnp.ones(2), (u[0] * x) ** 2))
         imagined = rollout(params, None, CONSTANT, dynamics=dynamics, policy=policy, match=matching.keep, noise=noise)
-        return jnp.sum(imagined.seen**2) + jnp.sum(imagined.u[..., 1] ** 2)
+        return jnp.sum(imagined.x[1:] ** 2) + jnp.sum(imagined.u[..., 1] ** 2)
 
     value, gradient = jax.jit(loss), jax.jit(jax.grad(loss))
     params = jnp.float32(0.1)
     assert value(params, 0.0) != value(2 * params, 0.0)  # the noise does depend on the parameters
     assert gradient(params, 0.0) == 0
     assert gradient(params, 0.1) != 0
-
-
-# Truncated back-propagation
-
-
-def truncated(truncate):
-    """(states, gradient of the mean square) of a linear plant under a linear policy, as a function of its gain."""
-    dynamics, policy = known(PENDULUM), linear_policy(2, 1)
-    none = jnp.zeros((6, 3, 2))
-    given = Scenarios(jax.random.normal(jax.random.key(0), (3, 2)), jnp.zeros(3), jnp.zeros(3), none, none)
-
-    def value(gain):
-        x = rollout(gain, None, given, dynamics=dynamics, policy=policy, match=matching.keep, truncate=truncate).x
-        return jnp.mean(x[1:] ** 2), x
-
-    gain = jnp.array([[-0.4, -1.1]])
-    gradient, x = jax.jit(jax.grad(value, has_aux=True))(gain)
-    return np.asarray(x), np.asarray(gradient), np.asarray(gain)
-
-
-@pytest.mark.parametrize("truncate", [1, 2, 4])
-def test_truncation_is_the_gradient_with_states_held_at_the_cuts(truncate, x64):
-    """By hand: each stretch starts at a state that does not depend on the gain."""
-    x, gradient, gain = truncated(truncate)
-    plain, whole, _ = truncated(None)
-    np.testing.assert_array_equal(x, plain)  # what is imagined does not change
-
-    def stretches(gain):
-        total = 0.0
-        for t in range(0, 6, truncate):
-            state = jnp.asarray(x[t])
-            for _ in range(t, min(t + truncate, 6)):
-                state = state @ (PENDULUM.a + PENDULUM.b @ gain).T
-                total += jnp.sum(state**2)
-        return total / 36
-
-    np.testing.assert_allclose(gradient, jax.grad(stretches)(jnp.asarray(gain)), rtol=1e-9)
-    assert not np.allclose(gradient, whole)
-
-
-def test_a_cut_beyond_the_horizon_cuts_nothing(x64):
-    np.testing.assert_allclose(truncated(6)[1], truncated(None)[1], rtol=1e-12)
 
 
 # The limit of a particle's gradient

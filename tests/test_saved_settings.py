@@ -1,5 +1,6 @@
 """A run's config on disk: what is saved is loaded to the last bit, and a file that is no config says so."""
 
+import re
 from functools import partial
 
 import jax
@@ -8,11 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pegasus_jax import config, config_models
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import SettingError, shown
 from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
+from pegasus_jax.presets import ALGORITHMS
 from pegasus_jax.runs import config_io
+from pegasus_jax.runs.removed import REMOVED
 from pegasus_jax.tasks import TASKS
-from pegasus_jax.variants import ALGORITHMS
 from test_settings import parse
 
 positive = st.floats(1e-6, 1e3)
@@ -26,14 +28,9 @@ configs = st.builds(
     model=st.builds(
         BNN,
         low=st.floats(-20, -0.1),
-        high=st.floats(0, 3),
         hidden=layers,
         dropout=st.sampled_from(config_models.DROPOUTS),
-        rate=st.floats(0, 0.99),
-        input_noise=st.booleans(),
         heteroscedastic=st.booleans(),
-        head=st.sampled_from(config_models.HEADS),
-        whitening=st.sampled_from(["full", "diagonal"]),
         weight_decay=st.floats(0, 10),
         initialiser=st.sampled_from(config.INITIALISERS),
     ),
@@ -42,11 +39,9 @@ configs = st.builds(
         hidden=layers,
         dropout=st.floats(0, 0.99),
         squash=st.sampled_from(config.SQUASHES),
-        execution=st.sampled_from(config.EXECUTIONS),
-        output_scale=positive,
         initialiser=st.sampled_from(config.INITIALISERS),
     ),
-    fit=st.builds(Fit, steps=whole(1), batch=whole(1), learning_rate=positive, reset=st.booleans()),
+    fit=st.builds(Fit, steps=whole(1), batch=whole(1), learning_rate=positive),
     search=st.builds(
         Search,
         steps=whole(1),
@@ -56,11 +51,9 @@ configs = st.builds(
         match=st.booleans(),
         balanced=st.booleans(),
         aggregate=st.sampled_from(config.AGGREGATES),
-        discount=st.floats(0.01, 1),
         reset=st.booleans(),
         policy_noise=st.floats(0, 10),
         state_noise=st.floats(0, 10),
-        cost_noise=st.floats(0, 10),
         period=st.builds(Period, *[whole(0)] * 5),
     ),
     explore=st.builds(Explore, trials=st.integers(0, 10**4), kind=st.sampled_from(config.EXPLORATIONS)),
@@ -120,8 +113,24 @@ def test_what_was_parsed_survives_the_file(algorithm, tmp_path):
     assert jax.tree.leaves(config_io.override(loaded, {"trials": 20}).trials) == [20]
 
 
-@pytest.mark.parametrize("ends", [(1.0, 5.0), (-20.0, -12.0)])
-def test_any_interval_survives_the_file(ends, tmp_path):
-    chosen = Config(model=BNN(low=ends[0], high=ends[1]))
-    config_io.save(chosen, tmp_path / "config.yaml")
-    assert config_io.load(tmp_path / "config.yaml") == chosen
+@pytest.mark.parametrize("key", REMOVED)
+def test_a_removed_setting_is_read_at_its_old_default_and_refused_at_another_value(key, tmp_path):
+    """And as a word of a command it is refused with what serves instead."""
+    chosen = parse("model=gp") if key == "model.features" else parse("model=ssgp") if key == "model.points" else parse()
+    path = tmp_path / "config.yaml"
+    config_io.save(chosen, path)
+    today, always = path.read_text(), REMOVED[key].always
+    path.write_text(f"{today}{key}: {shown(always)}\n", encoding="utf-8")
+    assert config_io.load(path) == chosen
+    other = {bool: not always, str: "another", type(None): 3}.get(type(always), 0.25)
+    path.write_text(f"{today}{key}: {shown(other)}\n", encoding="utf-8")
+    with pytest.raises(SettingError) as refused:
+        config_io.load(path)
+    assert f"{path}: {key}={shown(other)} was removed, only {shown(always)} is left" in str(refused.value)
+    for call in (lambda: parse(f"{key}={shown(always)}"), lambda: config_io.override(chosen, {key: always})):
+        with pytest.raises(SettingError, match=rf"^{key} was removed; instead: ") as refused:
+            call()
+        assert len(str(refused.value).splitlines()) == 1
+        named = re.findall(r"(\w+\.\w+)=", str(refused.value))
+        assert {*named} <= {*config_io.leaves(Config())}, "what serves instead is there"
+    assert key not in config_io.leaves(chosen)

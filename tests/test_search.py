@@ -74,9 +74,7 @@ def test_the_gradient_equals_finite_differences(x64):
     gradient is meant to flow through a predicted one."""
     r = make_rig(particles=7, horizon=4, heteroscedastic=False)
     given = jax.jit(lambda k: scenarios.draw(k, 0, r.belief, blocks=r.blocks, period=Period()))(jax.random.key(0))
-    pieces = dict(
-        dynamics=r.dynamics, policy=r.policy, match=matching.match, cost=r.cost, noise=NoiseUse(1.0, 0.5, 0.5)
-    )
+    pieces = dict(dynamics=r.dynamics, policy=r.policy, match=matching.match, cost=r.cost, noise=NoiseUse(1.0, 0.5))
     value = jax.jit(partial(objective, **pieces))
     gradient = jax.jit(jax.grad(partial(objective, **pieces)))(r.params, r.belief, given)
     for seed in range(4):

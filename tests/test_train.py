@@ -250,7 +250,7 @@ def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:
 def test_a_run_goes_on_with_another_search(whole: Path, tmp_path: Path) -> None:
     """Also with one whose optimiser remembers more; what was learned and written before stays as it is."""
     run = copy_until(whole, tmp_path / "run", 9)
-    done = call("train", f"resume={run}", "trials=4", "search.steps=3", "search.best=true", cwd=tmp_path)
+    done = call("train", f"resume={run}", "trials=4", "search.steps=3", "search.starts=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "not usable" not in done.stderr
     rows = store.trials(run)
@@ -259,9 +259,9 @@ def test_a_run_goes_on_with_another_search(whole: Path, tmp_path: Path) -> None:
     assert np.isfinite(rows[3]["objective_last"])
     about = json.loads((run / "run.json").read_text())
     assert [command["done"] for command in about["commands"]] == [0, 3]
-    assert "search.best=true" in about["commands"][1]["command"]
+    assert "search.starts=2" in about["commands"][1]["command"]
     now = config_io.leaves(config_io.load(run / "config.yaml"))
-    assert (now["search.steps"], now["search.best"]) == (3, True)
+    assert (now["search.steps"], now["search.starts"]) == (3, 2)
 
 
 def test_two_processes_cannot_write_to_one_run(whole: Path, tmp_path: Path) -> None:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from pegasus_jax.policies.linear import linear
     from pegasus_jax.policies.mlp import mlp
     from pegasus_jax.policies.wrap import of_pair
+    from pegasus_jax.presets import preset
     from pegasus_jax.runs.controller import Controller, controller
     from pegasus_jax.types import (
         Batch,
@@ -58,6 +59,7 @@ if TYPE_CHECKING:
 _NAMES = {
     # a run, from settings
     "config": "Config",
+    "presets": "preset",
     "builder": "build compose dynamics_of policy_of",
     "experiment": "run trial TrialInfo",
     "checks": "SettingError RunError",
@@ -151,6 +153,7 @@ __all__ = [
     "optimise",
     "particles",
     "policy_of",
+    "preset",
     "rbf",
     "rollout",
     "run",

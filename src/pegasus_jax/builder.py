@@ -20,13 +20,12 @@ from pegasus_jax.imagine.rollout import NoiseUse, rollout
 from pegasus_jax.learn.fit import falling, minibatches
 from pegasus_jax.learn.multistart import best_of
 from pegasus_jax.learn.schedule import Course, either, narrowing, pace, reheated
-from pegasus_jax.learn.search import keeping_best, objective, particles, remembering
+from pegasus_jax.learn.search import objective, particles
 from pegasus_jax.math import angles, gaussian
 from pegasus_jax.models import dropout
 from pegasus_jax.models.bnn import bnn
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.models.lagrangian import lagrangian
-from pegasus_jax.models.noisy import HEADS
 from pegasus_jax.pilco import search as pilco
 from pegasus_jax.pilco.gp import gp
 from pegasus_jax.pilco.lbfgs import full_data
@@ -56,9 +55,9 @@ from pegasus_jax.types import (
 
 AGGREGATES = {"mean": cost.mean, "total": cost.total}
 NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
-    "log_normal": lambda config: dropout.log_normal(config.low, config.high),
-    "binary": lambda config: dropout.binary(config.rate),
-    "concrete": lambda config: dropout.concrete(config.rate),
+    "log_normal": lambda config: dropout.log_normal(config.low),
+    "binary": lambda _: dropout.binary(),
+    "concrete": lambda _: dropout.concrete(),
     "gaussian": lambda _: dropout.gaussian(),
     "sparse": lambda _: dropout.sparse(),
     "none": lambda _: dropout.none(),
@@ -110,7 +109,6 @@ def compose(
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
         compare=config.successor == "better",
-        mean_execution=config.policy.execution == "mean",
         capacity=config.trials * task.horizon,
     )
 
@@ -142,7 +140,7 @@ def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
     if isinstance(config, settings.LBFGS):
         return full_data(dynamics, starts=config.starts)
     rate = falling(config.learning_rate, config.decay, config.steps)
-    return minibatches(dynamics, optax.adam(rate), batch=config.batch, reset=config.reset)
+    return minibatches(dynamics, optax.adam(rate), batch=config.batch)
 
 
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]  # (key, policy parameters, belief) -> cost [H, K] too
@@ -158,21 +156,18 @@ def search_of(
     """The configured way of improving a policy, and fresh imagined rollouts of the same kind."""
     aggregate = AGGREGATES[search.aggregate]
     known = tasks.known_sensors(task) if search.sensors == "known" else None
-    noise = NoiseUse(search.policy_noise, search.state_noise, search.cost_noise, known)
+    noise = NoiseUse(search.policy_noise, search.state_noise, known)
     if isinstance(search, settings.Analytic):
-        return analytic_search_of(search, task, dynamics, policy, discounted(search, aggregate), noise)
+        return analytic_search_of(search, task, dynamics, policy, aggregate, noise)
     if (search.match or search.balanced) and search.particles <= len(task.state_names):
         states, what = len(task.state_names), "moment matching" if search.match else "balanced draws"
         raise SettingError(
             f"search.particles={search.particles} is too few: {what} of {states} dimensions needs at least {states + 1}"
         )
-    if search.risk < 1:
-        aggregate = cost.worst(search.risk, aggregate)
     blocks = blocks_of(search.particles, task, dynamics, policy, balanced=search.balanced, spread=spread)
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
     # A particle's cost is 1 / K of the objective.
     limit = None if search.limit is None else search.limit / search.particles
-    ends: dict[str, Any] = dict(aggregate=discounted(search, aggregate), truncate=search.truncate)
     match = matching.match if search.match else matching.keep
     costs = costs_of(search, task)
     # The last part of a search is for refining: no matching, each particle's own cost, at its own width.
@@ -189,13 +184,13 @@ def search_of(
         cost = costs(refining, width and width(iteration))
         onwards = either(refining, matching.keep, match)
         longest = limit * jnp.where(iteration < steps, 1, search.loosen) if limit and search.reheat else limit
-        return objective(params, belief, given, **pieces, **ends, limit=longest, match=onwards, cost=cost)
+        return objective(params, belief, given, **pieces, aggregate=aggregate, limit=longest, match=onwards, cost=cost)
 
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
     searcher = particles(
         value,
-        remembering(optimizer) if search.best else optimizer,
+        optimizer,
         blocks=blocks,
         period=Period(**vars(search.period)),
         course=Course(
@@ -206,8 +201,6 @@ def search_of(
             anew=search.anew,
         ),
     )
-    if search.best:
-        searcher = keeping_best(searcher, search.steps)
     if search.starts > 1:
         lasting = search.anneal > 1  # one course for all searches: who began late would be behind
         window = 1 if search.refine else max(1, search.steps // 20)  # what refines may end with another than its last
@@ -300,11 +293,6 @@ def expected_cost_of(task: Task) -> cost.Expected:
     return task.expected_cost or cost.expected_by_nodes(task.cost, len(task.state_names))
 
 
-def discounted(search: settings.Search | settings.Analytic, aggregate: cost.Aggregate) -> cost.Aggregate:
-    """The aggregate, discounted where the search says so."""
-    return cost.discounted(search.discount, aggregate) if search.discount < 1 else aggregate
-
-
 def blocks_of(
     particles: int,
     task: Task,
@@ -336,7 +324,7 @@ def imagined(
 ) -> tuple[Rollout, Array]:
     """Rollouts under fresh scenarios and the cost of every particle [H, K]."""
     rolled = rollout(params, belief, scenarios.draw(key, 0, belief, blocks=blocks, period=Period()), **pieces)
-    return rolled, until_stop(task, of_particles(task.cost))(rolled.seen)
+    return rolled, until_stop(task, of_particles(task.cost))(rolled.x[1:])
 
 
 def start(key: Key, *, task: Task) -> Array:
@@ -350,20 +338,14 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
     shape: dict[str, Any] = dict(states=len(task.state_names), controls=len(task.control_names), angles=task.angles)
     match config:
         case settings.GP():
-            return gp(**shape, features=config.features)
+            return gp(**shape)
         case settings.SSGP():
-            return ssgp(**shape, points=config.points)
+            return ssgp(**shape)
         case settings.Lagrangian():
             rates = tasks.rates_of(task)
             member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
         case settings.BNN():
-            member = bnn(
-                **shape,
-                **network_of(config),
-                input_dropout=dropout_of(config) if config.input_noise else None,
-                heteroscedastic=config.heteroscedastic,
-                full_whitening=config.whitening == "full",
-            )
+            member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic)
     return ensemble(member, config.members) if config.members > 1 else member
 
 
@@ -372,7 +354,6 @@ def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
     return dict(
         hidden=config.hidden,
         dropout=dropout_of(config),
-        head=HEADS[config.head],
         kl_weight=config.kl_weight,
         weight_decay=config.weight_decay,
         activation=config.activation,
@@ -425,5 +406,4 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
                 saturate=saturate,
                 initialiser=config.initialiser,
                 input_scale=tasks.input_scale(task, config.input_units),
-                output_scale=config.output_scale,
             )

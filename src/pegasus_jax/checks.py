@@ -14,8 +14,6 @@ SIZES = {
     "particles": 10**6,
     "batch": 10**6,
     "hidden": 10**5,
-    "points": 10**5,
-    "features": 10**5,
     "units": 10**5,
     "starts": 10**4,
     "members": 10**3,
@@ -51,11 +49,16 @@ def choice(name: str, value: Any, choices: Iterable[Any]) -> None:
         raise SettingError(f"{name}={value} is not a choice; {nearest(value, choices)}")
 
 
-def within(name: str, value: float, low: float, high: float = math.inf, *, open_low: bool = False) -> None:
-    """Raises SettingError unless low <= value <= high, or low < value, and it is finite."""
-    if not math.isfinite(value) or value > high or value < low or (open_low and value == low):
-        interval = f"{'(' if open_low else '['}{number(low)}, {number(high)}{')' if high == math.inf else ']'}"
-        nearest_value = min(max(value, low), high) if math.isfinite(value) and (not open_low or value > high) else None
+def within(
+    name: str, value: float, low: float, high: float = math.inf, *, open_low: bool = False, open_high: bool = False
+) -> None:
+    """Raises SettingError unless the value is finite and from low to high, an end that is open left out."""
+    outside = value < low or value > high or (open_low and value == low) or (open_high and value == high)
+    if outside or not math.isfinite(value):
+        left, right = "(" if open_low or low == -math.inf else "[", ")" if open_high or high == math.inf else "]"
+        interval = f"{left}{number(low)}, {number(high)}{right}"
+        open_end = open_high if value >= high else open_low
+        nearest_value = min(max(value, low), high) if math.isfinite(value) and not open_end else None
         hint = f"; the nearest is {number(nearest_value)}" if nearest_value is not None else ""
         raise SettingError(f"{name}={number(value)} is out of range; expected a number in {interval}{hint}")
 

@@ -5,20 +5,24 @@ Values are checked when a config is made; a bad one raises `SettingError`, which
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from pegasus_jax import checks
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config_models import BNN, GP, INITIALISERS, SSGP, Lagrangian, setting
 
-GYM, MJCF = ("gym",), ("mjcf",)
-OWN = (*GYM, *MJCF)
+MANOEUVRES = ("knife_edge", "belly_up", "corkscrew", "depth_change")
+GYM = "gym"  # the task that `env=` and `cost=` describe
+MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe
+TASKS = ("cartpole", "double_cartpole", *(f"swimmer_{manoeuvre}" for manoeuvre in MANOEUVRES), GYM, MJCF)
+OWN = (GYM, MJCF)
 
 SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
 AGGREGATES = ("mean", "total")
 COSTS = ("particles", "matched")
 SENSORS = ("predicted", "known")
-EXECUTIONS = ("sampled", "mean")
 LEGS = (2, 6)
 PRECISIONS = ("single", "double")
 SUCCESSORS = ("always", "better")
@@ -32,22 +36,20 @@ class MLP:
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: float = setting(0.0, "drop probability of the hidden units; 0 is a deterministic policy")
     squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
-    execution: str = setting("sampled", "on the plant: sampled (a fresh mask each step, explores), or mean")
     input_units: tuple[float, ...] = setting(
         (), "unit of each state that is not an angle, one number each; []: the plant's units"
     )
-    output_scale: float = setting(1.0, "factor of the last layer's initial weights")
     initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
         checks.typed("policy", self)
         checks.kind("policy", self.kind, "mlp")
         checks.layers("policy.hidden", self.hidden)
-        for name, choices in (("squash", SQUASHES), ("execution", EXECUTIONS), ("initialiser", INITIALISERS)):
+        for name, choices in (("squash", SQUASHES), ("initialiser", INITIALISERS)):
             checks.choice(f"policy.{name}", getattr(self, name), choices)
         checks.within("policy.dropout", self.dropout, 0, 0.99)
-        for name, value in (("output_scale", self.output_scale), *(("input_units", unit) for unit in self.input_units)):
-            checks.within(f"policy.{name}", value, 0, open_low=True)
+        for unit in self.input_units:
+            checks.within("policy.input_units", unit, 0, open_low=True)
 
 
 @dataclass(frozen=True)
@@ -57,7 +59,6 @@ class RBF:
     kind: str = setting("rbf", "")
     units: int = setting(30, "radial basis functions")
     squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
-    execution = "mean"  # no setting: there is nothing to sample
 
     def __post_init__(self) -> None:
         checks.typed("policy", self)
@@ -72,7 +73,6 @@ class Linear:
 
     kind: str = setting("linear", "")
     squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
-    execution = "mean"  # no setting: there is nothing to sample
 
     def __post_init__(self) -> None:
         checks.typed("policy", self)
@@ -89,7 +89,6 @@ class Fit:
     batch: int = setting(100, "rows an update")
     learning_rate: float = setting(3e-4, "Adam's step size")
     decay: float = setting(1.0, "step size at the end of a fit, as a fraction of that at its start")
-    reset: bool = setting(False, "forget Adam's moments at each trial")
 
     def __post_init__(self) -> None:
         checks.typed("fit", self)
@@ -142,7 +141,6 @@ class Search:
     match: bool = setting(True, "moment matching")
     balanced: bool = setting(False, "make the drawn noise exactly zero mean, unit covariance over the particles")
     aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
-    discount: float = setting(1.0, "weight of a later step against the one before")
     cost: str = setting(
         "matched", "matched: expected cost of the matched Gaussian; particles: mean cost of the particles"
     )
@@ -151,8 +149,6 @@ class Search:
     )
     widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
     anneal: int = setting(1, "trials over which widen= and decay= run down once; 1: in every search")
-    risk: float = setting(1.0, "fraction of the particles, the costliest, that count (CVaR); 1: all")
-    truncate: int | None = setting(None, "cut the gradient through the state every so many steps; null: never")
     limit: float | None = setting(
         None, "drop a particle's gradient with respect to its state where it is longer; null: never"
     )
@@ -160,7 +156,6 @@ class Search:
         0.0, "after `anneal` trials: step size at the start of each search, as a fraction; 0: constant"
     )
     loosen: float = setting(1.0, "factor of the limit in the searches that are reheated")
-    best: bool = setting(False, "end a search with the parameters of its lowest objective, not with the last")
     reset: bool = setting(True, "forget Adam's moments at each trial")
     restart: bool = setting(
         True, "start from a fresh policy if it costs less than the old one, or the last search found nothing better"
@@ -174,13 +169,12 @@ class Search:
     )
     policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
-    cost_noise: float = setting(0.0, "factor of the predicted noise on what the cost sees")
     period: Period = Period()
 
     def __post_init__(self) -> None:
         checks.typed("search", self)
         checks.kind("search", self.kind, "particles")
-        checks.least("search", self, 0, "policy_noise", "state_noise", "cost_noise")
+        checks.least("search", self, 0, "policy_noise", "state_noise")
         checks.least("search", self, 1, "widen", "loosen")
         checks.sizes("search", self, "steps", "anneal", "starts")
         checks.sizes("search", self, "particles", low=2)
@@ -189,13 +183,7 @@ class Search:
         checks.within("search.reheat", self.reheat, 0, 1)
         for name, choices in (("aggregate", AGGREGATES), ("cost", COSTS), ("sensors", SENSORS)):
             checks.choice(f"search.{name}", getattr(self, name), choices)
-        checks.within("search.discount", self.discount, 0, 1, open_low=True)
-        checks.within("search.risk", self.risk, 0, 1, open_low=True)
-        if self.risk < 1 and self.cost == "matched":
-            raise SettingError(f"search.risk={self.risk:g} needs the cost of each particle: search.cost=particles")
         checks.within("search.refine", self.refine, 0, 1)
-        if self.truncate is not None:
-            checks.within("search.truncate", self.truncate, 1)
         for name, value in (("clip", self.clip), ("limit", self.limit)):
             if value is not None:
                 checks.within(f"search.{name}", value, 0, open_low=True)
@@ -208,8 +196,8 @@ class Search:
             raise SettingError(
                 f"search.loosen={self.loosen:g} needs search.limit=1 search.reheat=0.3, or the like; the nearest is 1"
             )
-        if self.anneal > 1 and (self.refine or self.best):
-            raise SettingError(f"search.anneal={self.anneal} needs search.refine=0 search.best=false")
+        if self.anneal > 1 and self.refine:
+            raise SettingError(f"search.anneal={self.anneal} needs search.refine=0")
         if self.anew and not (self.restart and self.refine):
             raise SettingError("search.anew=true needs search.restart=true search.refine=0.5; the nearest is false")
         if self.starts > 1 and not self.reset:
@@ -224,21 +212,18 @@ class Analytic:
     steps: int = setting(300, "iterations of L-BFGS a trial, at most")
     particles: int = setting(100, "K, rollouts imagined afterwards for the record; the search has none")
     aggregate: str = setting("mean", "over the horizon: mean, or total, PILCO's sum")
-    discount: float = setting(1.0, "weight of a later step against the one before")
     restart: bool = setting(True, "start a search from a fresh policy when it expects a lower cost than the old one")
     policy_noise: float = setting(1.0, "factor of the model's noise on what the policy sees")
     state_noise: float = setting(1.0, "factor of the model's noise added to the state")
-    cost_noise: float = setting(0.0, "factor of the model's noise on what the cost sees")
     reset, anneal, sensors = True, 1, "predicted"  # no settings: curvature is that of one model
 
     def __post_init__(self) -> None:
         checks.typed("search", self)
         checks.kind("search", self.kind, "analytic")
-        checks.least("search", self, 0, "policy_noise", "state_noise", "cost_noise")
+        checks.least("search", self, 0, "policy_noise", "state_noise")
         checks.sizes("search", self, "steps")
         checks.sizes("search", self, "particles", low=2)
         checks.choice("search.aggregate", self.aggregate, AGGREGATES)
-        checks.within("search.discount", self.discount, 0, 1, open_low=True)
 
 
 @dataclass(frozen=True)
@@ -263,21 +248,23 @@ class Config:
 
     task: str = setting("cartpole", "what to learn")
     legs: int = setting(2, "that the swimmer drives: 2 or 6", ("swimmer_*",))
-    env: str | None = setting(None, "the environment's Gymnasium id", GYM)
-    mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", MJCF)
+    env: str | None = setting(None, "the environment's Gymnasium id", (GYM,))
+    mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", (MJCF,))
     cost: str | None = setting(None, "module:function, observation [D] -> cost in [0, 1], in JAX", OWN)
     angles: tuple[int, ...] = setting((), "the entries of the observation that are angles [rad]", OWN)
-    rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", GYM)
+    rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", (GYM,))
     horizon: int | None = setting(None, "control periods an episode; null: a gym's own limit, or 100", OWN)
     dt: float | None = setting(
         None, "control period [s]; null: a gym's own. A whole number of an mjcf's time steps", OWN
     )
-    env_args: tuple[str, ...] = setting((), "the environment's own arguments, each as env_args.port=/dev/ttyACM0", GYM)
+    env_args: tuple[str, ...] = setting(
+        (), "the environment's own arguments, each as env_args.port=/dev/ttyACM0", (GYM,)
+    )
     stop: str | None = setting(
         None, "module:function, observation [D] -> probability that an episode ends there, in JAX", OWN
     )
     stop_cost: float = setting(1.0, "of each control period that an early end leaves out", OWN)
-    observe: tuple[str, ...] = setting((), "as [qpos.0,qvel.1]; []: all positions, then all velocities", MJCF)
+    observe: tuple[str, ...] = setting((), "as [qpos.0,qvel.1]; []: all positions, then all velocities", (MJCF,))
     control_low: tuple[float, ...] = setting((), "least controls; []: the action space's, the file's ctrlrange", OWN)
     control_high: tuple[float, ...] = setting(
         (), "greatest controls; []: the action space's, the file's ctrlrange", OWN
@@ -321,3 +308,20 @@ class Config:
         checks.sizes("", self, "trials")
         checks.sizes("", self, "evaluation", low=0)
         checks.rows(self.trials, self.horizon)
+
+
+# What each section can be, by the kind that a stored config names.
+KINDS: dict[str, dict[str, Any]] = {
+    "model": {"bnn": BNN(), "gp": GP(), "ssgp": SSGP(), "lagrangian": Lagrangian()},
+    "policy": {"mlp": MLP(), "rbf": RBF(), "linear": Linear()},
+    "fit": {"adam": Fit(), "lbfgs": LBFGS()},
+    "search": {"particles": Search(), "analytic": Analytic()},
+}
+
+
+def label(config: Config) -> str:
+    """The task with what tells it from others of its name, as part of a folder's name."""
+    if config.task.startswith("swimmer_"):
+        return f"{config.task}-legs{config.legs}"
+    own = {GYM: config.env, MJCF: Path(config.mjcf or "").stem}.get(config.task)
+    return f"{config.task}-{own}".replace("/", "-").replace(":", "-") if own else config.task

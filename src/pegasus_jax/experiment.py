@@ -67,7 +67,6 @@ def experiment(
     imagine: Callable[[Key, Params, Params], tuple[Rollout, Array]],
     explore: Callable[[Key], Array],
     explore_trials: int,
-    mean_execution: bool,
     compare: bool,
     capacity: int,
 ) -> Experiment:
@@ -92,7 +91,7 @@ def experiment(
         )
 
     def act(params: Params, key: Key, x: Array) -> Array:
-        return policy.apply(params, None if mean_execution else policy.sample(key), x)
+        return policy.apply(params, policy.sample(key), x)
 
     def one_episode(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
         """An episode of the policy, or of random controls. One function, because a plant is slow to compile."""
@@ -118,15 +117,12 @@ def experiment(
         plan = np.asarray(plan_of(plan_key))
         noise = jax.tree.map(np.asarray, noise_of(noise_key))
         # Compiled before the robot moves: the first control is to be as quick as the others.
-        react(
-            policy_params, None if mean_execution else jax.tree.map(lambda z: z[0], noise), np.zeros(states, np.float32)
-        )
+        react(policy_params, jax.tree.map(lambda z: z[0], noise), np.zeros(states, np.float32))
 
         def control(t: int, x: np.ndarray) -> np.ndarray:
             if exploring:
                 return plan[t]
-            drawn = None if mean_execution else jax.tree.map(lambda z: z[t], noise)
-            return np.asarray(react(policy_params, drawn, x))
+            return np.asarray(react(policy_params, jax.tree.map(lambda z: z[t], noise), x))
 
         found = episode.drive(seed, control, task)
         whole = episode.padded(found.trajectory, task.horizon)

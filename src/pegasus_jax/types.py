@@ -77,7 +77,6 @@ class Rollout(NamedTuple):
     x: Array  # [H+1, K, D] states
     u: Array  # [H, K, U] controls
     std: Array  # [H, K, D] predicted noise of the states 1..H
-    seen: Array  # [H, K, D] the states 1..H as the cost sees them
 
 
 class Dropout(NamedTuple):

@@ -82,7 +82,7 @@ def combinations() -> list[Command]:
     )
     mjcf = (*BASE[1:], "task=mjcf", "cost=robots:cost")
     of_mjcf = ("mjcf=none.xml", "mjcf=.", "mjcf=robots.py", "mjcf=/dev/null", "mjcf=empty.xml")
-    texts = ["search.risk=.5", "search.starts=2 search.reset=false", "model.low=1 model.high=0", "policy.dropout=2"]
+    texts = ["search.risk=.5", "search.starts=2 search.reset=false", "model.low=1", "policy.dropout=2"]
     lone = [("task=gym",), ("task=mjcf",), ("task=gym", "env=Pendulum-v1"), ("task=gym", "cost=robots:cost")]
     return [
         *(train(word, begin=gym, refused=True) for word in of_gym),

@@ -10,8 +10,10 @@ pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that 
                                                 fit.* or search.* settings
 
   task=cartpole         what to learn: {tasks}
+  preset=NAME           begin with these settings instead of the task's own, which are preset=TASK: {presets}
   model=log_normal      dynamics model: {models}
-                        (default: the one that learns the task best, of cartpole and double_cartpole lagrangian)
+                        (default: the one of the task's preset, which learns it best; any other begins with
+                        preset=TASK_network, whose settings do not depend on that one)
   policy=mlp            controller: {policies}
   algorithm=pegasus     how to search: {algorithms}
   out=runs/...          the run's folder (default: runs/TASK-seedN)
@@ -22,8 +24,9 @@ pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that 
   distributed=true      started on several hosts at once by SLURM or MPI: their devices act as one machine; without
                         those, coordinator=HOST:PORT processes=N process=I on each. They share OUT on one file system
 
-A task and a named variant bring their own values of the settings below, which change them one by one. Shown is what
-they are with the words beside --help: pegasus-train task=gym algorithm=paper --help
+A preset is a value for each of the settings below, which change it one by one; model=, policy= and algorithm= change
+whole sections of it first. Shown is what they are with the words beside --help:
+pegasus-train task=gym algorithm=paper --help
 {settings}
 {others}
 PEGASUS_SETTINGS="fit.steps=5 search.steps=5" in the environment adds these words to every pegasus-train and
@@ -120,11 +123,11 @@ def help_of(text: str, words: Sequence[str]) -> str:
     """A command's help; of its settings as these words leave them. Raises SettingError for words that cannot be."""
     if "{settings}" not in text:
         return text
-    from pegasus_jax.defaults import NAMES
+    from pegasus_jax.config import KINDS, TASKS
+    from pegasus_jax.presets import ALGORITHMS, MODELS, POLICIES, PRESETS
     from pegasus_jax.runs import config_io
-    from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
 
-    named = dict(tasks=NAMES, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
+    named = dict(tasks=TASKS, presets=PRESETS, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
     lists = {name: ", ".join(values) for name, values in named.items()}
     _, dotted = config_io.split([word for word in words if word not in WORDS], OPTIONS)
     config = config_io.parse(dotted, OPTIONS)

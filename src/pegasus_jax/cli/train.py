@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pegasus_jax.checks import SettingError, whole
-from pegasus_jax.config import Config, Search
+from pegasus_jax.config import GYM, Config, Search, label
 
 OPTIONS = (
     "out",
@@ -67,7 +67,6 @@ def train(words: Sequence[str]) -> None:
 
 def understood(words: Sequence[str]) -> Asked:
     """What the words ask for. Raises SettingError for what cannot be; nothing of the user's is imported for that."""
-    from pegasus_jax import defaults
     from pegasus_jax.runs import config_io
 
     options, rest = config_io.split(words, OPTIONS)
@@ -75,7 +74,7 @@ def understood(words: Sequence[str]) -> Asked:
         if options.get(name) == "":
             raise SettingError(f"{name}= names no folder; for example {name}=runs/demo")
     asked = _resumed(options, rest) if "resume" in options else _new(options, rest)
-    if len(asked.runs) > 1 and asked.config.task == defaults.GYM:
+    if len(asked.runs) > 1 and asked.config.task == GYM:
         raise SettingError(
             f"seeds={len(asked.runs)} is too many for task=gym, whose environment is one object; seeds=1"
         )
@@ -102,7 +101,6 @@ def _resumed(options: dict[str, str], rest: dict[str, str]) -> Asked:
 
 
 def _new(options: dict[str, str], rest: dict[str, str]) -> Asked:
-    from pegasus_jax import defaults
     from pegasus_jax.runs import config_io
 
     config = config_io.parse(rest, options=OPTIONS)
@@ -110,7 +108,7 @@ def _new(options: dict[str, str], rest: dict[str, str]) -> Asked:
 
     seeds = range(config.seed, config.seed + whole("seeds", options.get("seeds", "1")))
     name = f"seed{seeds[0]}" if len(seeds) == 1 else f"seeds{seeds[0]}-{seeds[-1]}"
-    home = Path(options["out"]) if "out" in options else store.free(Path(f"runs/{defaults.label(config)}-{name}"))
+    home = Path(options["out"]) if "out" in options else store.free(Path(f"runs/{label(config)}-{name}"))
     runs = {config.seed: home} if len(seeds) == 1 else {seed: home / f"seed{seed}" for seed in seeds}
     return Asked(config, home, runs, options, None, "start_mean" in rest)
 

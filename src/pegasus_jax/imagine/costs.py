@@ -138,29 +138,3 @@ def mean(costs: Array) -> Array:
 def total(costs: Array) -> Array:
     """Cost of an episode, averaged over particles: the paper's eq. 1 and Alg. 3 line 15."""
     return jnp.sum(jnp.mean(costs, 1))
-
-
-def discounted(discount: float, aggregate: Aggregate = mean) -> Aggregate:
-    """The aggregate of costs weighted by discount^t."""
-
-    def weighted(costs: Array) -> Array:
-        return aggregate(costs * discount ** jnp.arange(costs.shape[0], dtype=costs.dtype)[:, None])
-
-    return weighted
-
-
-def worst(fraction: float, aggregate: Aggregate = mean) -> Aggregate:
-    """The aggregate of the costliest `fraction` of the K particles, by mean cost a step: CVaR at level 1 - fraction.
-
-    Where fraction * K is not whole, the last particle counts in part (Rockafellar & Uryasev 2002). A `discounted`
-    around it ranks by discounted cost.
-    """
-
-    def tail(costs: Array) -> Array:
-        particles = costs.shape[1]
-        order = jnp.argsort(-jnp.mean(costs, 0))
-        rank = jnp.argsort(order)  # 0: the costliest
-        share = jnp.clip(fraction * particles - rank, 0, 1) / fraction
-        return aggregate(costs * share)
-
-    return tail

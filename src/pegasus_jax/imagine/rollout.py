@@ -20,7 +20,6 @@ class NoiseUse(NamedTuple):
 
     policy: float = 1.0  # the policy sees x_t + factor * std_t * noise_t
     state: float = 0.0  # the state itself moves by factor * std * noise
-    cost: float = 0.0  # the cost sees x_t + factor * std_t * noise_t
     sensors: Any = None  # [D] the std of what the policy sees, where it is known; None: as predicted
 
 
@@ -33,15 +32,13 @@ def rollout(
     policy: Policy,
     match: Callable[[Array, Array], Array],
     noise: NoiseUse = NoiseUse(),
-    truncate: int | None = None,
     limit: Array | float | None = None,
 ) -> Rollout:
     """Roll K particles out for H steps (Alg. 3 lines 6 to 14).
 
     Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match` is
-    `moments.match` or `moments.keep`. No gradient flows through the predicted noise, nor, with `truncate`, through
-    the states 0, truncate, 2 truncate, ...: truncated back-propagation through time. With a `limit`, none goes
-    back through a particle's state that is longer than that.
+    `matching.match` or `matching.keep`. No gradient flows through the predicted noise. With a `limit`, none goes back
+    through a particle's state that is longer than that.
 
     Raises ValueError, while it is traced, where shapes do not agree; the message names the argument.
     """
@@ -53,9 +50,7 @@ def rollout(
 
     def step(carry: tuple[Array, Array], draws: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple]:
         x, seeing = carry
-        t, sensor, redraw = draws
-        if truncate is not None:
-            x = jnp.where(t % truncate == 0, jax.lax.stop_gradient(x), x)
+        sensor, redraw = draws
         if limit is not None:
             x = limited(x, limit)
         u = act(policy_params, scenarios.policy, x + noise.policy * seeing)
@@ -67,14 +62,13 @@ def rollout(
         blur = std * sensor
         after = match(x + change.mean + noise.state * blur, redraw)
         seeing = blur if noise.sensors is None else noise.sensors * sensor
-        return (after, seeing), (after, u, std, after + noise.cost * blur)
+        return (after, seeing), (after, u, std)
 
     start = scenarios.start
-    times = jnp.arange(scenarios.match.shape[0])
-    draws = (times, scenarios.sensor, scenarios.match)
+    draws = (scenarios.sensor, scenarios.match)
     unroll = UNROLL.get(jax.default_backend(), 1)
-    _, (x, u, std, seen) = jax.lax.scan(step, (start, jnp.zeros_like(start)), draws, unroll=unroll)
-    return Rollout(jnp.concatenate([start[None], x]), u, std, seen)
+    _, (x, u, std) = jax.lax.scan(step, (start, jnp.zeros_like(start)), draws, unroll=unroll)
+    return Rollout(jnp.concatenate([start[None], x]), u, std)
 
 
 def limited(x: Array, limit: Array | float) -> Array:

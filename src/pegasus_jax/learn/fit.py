@@ -78,14 +78,10 @@ def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
     return lambda count: fall(jnp.asarray(count) % steps)
 
 
-def minibatches(
-    dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch: int, reset: bool = False
-) -> Fitter:
-    """The fitter that takes `optimizer`'s steps on minibatches; with `reset` each fit begins with a fresh state."""
+def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch: int) -> Fitter:
+    """The fitter that takes `optimizer`'s steps on minibatches; each fit goes on with the moments of the one before."""
 
     def run(key: Key, learner: Learner, data: Dataset, steps: int) -> tuple[Learner, FitInfo]:
-        if reset:
-            learner = Learner(learner.params, optimizer.init(learner.params))
         return fit(
             key,
             learner,

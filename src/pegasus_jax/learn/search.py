@@ -59,7 +59,6 @@ def objective(
     cost: Callable[[Array], Array],
     aggregate: Callable[[Array], Array] = costs.mean,
     noise: NoiseUse = NoiseUse(),
-    truncate: int | None = None,
     limit: Array | float | None = None,
 ) -> Array:
     """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
@@ -71,10 +70,9 @@ def objective(
         policy=policy,
         match=match,
         noise=noise,
-        truncate=truncate,
         limit=limit,
     )
-    return aggregate(cost(imagined.seen))
+    return aggregate(cost(imagined.x[1:]))
 
 
 class Started(NamedTuple):

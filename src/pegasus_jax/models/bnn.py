@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from pegasus_jax.math.angles import encode
-from pegasus_jax.math.normalize import Whitener, unwhiten, whiten, whitener
-from pegasus_jax.models.noisy import Head, Masks, misfit, noisy
-from pegasus_jax.types import Array, Batch, Dataset, Dropout, Dynamics, Key, Params, Prediction
+from pegasus_jax.math.normalize import Whitener, unwhiten, whitener
+from pegasus_jax.models.noisy import HEADS, Head, Masks, misfit, noisy
+from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 
 
 class Scaling(NamedTuple):
@@ -21,7 +21,7 @@ class Scaling(NamedTuple):
 class Belief(NamedTuple):
     """A fitted network whose outer layers contain the scaling, so that a rollout does not repeat it at each step."""
 
-    network: Params  # centred inputs (white ones, where they carry noise) -> change of state [D], raw std [D]
+    network: Params  # centred inputs -> change of state [D], raw std [D]
     raw_std: Array | None  # [D], of a network that does not predict it
     noise: Params
     scaling: Scaling
@@ -33,20 +33,18 @@ def bnn(
     controls: int,
     angles: tuple[int, ...],
     hidden: tuple[int, ...],
-    input_dropout: Dropout | None,
-    head: Head,
     heteroscedastic: bool,
-    full_whitening: bool,
+    head: Head = HEADS["sigmoid"],
     **noise: Any,
 ) -> Dynamics:
     """A BNN over (encoded state, control) -> change of state [D], with its noise std [D].
 
-    With `heteroscedastic` the noise std is a function of the input, otherwise one vector of parameters. `hidden`,
-    `input_dropout` and `noise` describe the network, as `noisy` has them.
+    With `heteroscedastic` the noise std is a function of the input, otherwise one vector of parameters. `hidden`
+    and `noise` describe the network, as `noisy` has them.
     """
     features = states + len(angles) + controls
     outputs = states * (2 if heteroscedastic else 1)
-    network = noisy(features=features, hidden=hidden, outputs=outputs, input_dropout=input_dropout, **noise)
+    network = noisy(features=features, hidden=hidden, outputs=outputs, **noise)
 
     def init(key: Key) -> Params:
         return network.init(key) | ({} if heteroscedastic else {"raw_std": jnp.zeros(states)})
@@ -55,16 +53,11 @@ def bnn(
         return jnp.concatenate([encode(x, angles), u], -1)
 
     def prepare(data: Dataset) -> Scaling:
-        return Scaling(
-            whitener(inputs_of(data.x, data.u), data.size, full=full_whitening),
-            whitener(data.y, data.size, full=full_whitening),
-            data.size,
-        )
+        return Scaling(whitener(inputs_of(data.x, data.u), data.size), whitener(data.y, data.size), data.size)
 
     def believe(params: Params, scaling: Scaling) -> Belief:
         layers = dict(params["network"]["params"])
-        if not input_dropout:
-            layers["layer_0"] = {**layers["layer_0"], "kernel": scaling.inputs.inverse.T @ layers["layer_0"]["kernel"]}
+        layers["layer_0"] = {**layers["layer_0"], "kernel": scaling.inputs.inverse.T @ layers["layer_0"]["kernel"]}
         last, targets = layers[f"layer_{len(hidden)}"], scaling.targets
         kernel, bias = last["kernel"], last["bias"]
         layers[f"layer_{len(hidden)}"] = {
@@ -75,8 +68,7 @@ def bnn(
 
     def predict(belief: Belief, masks: Masks, x: Array, u: Array) -> Prediction:
         inputs, scaling = inputs_of(x, u), belief.scaling
-        inputs = whiten(scaling.inputs, inputs) if input_dropout else inputs - scaling.inputs.mean
-        out = network.apply(belief.network, inputs, masks)
+        out = network.apply(belief.network, inputs - scaling.inputs.mean, masks)
         mean, raw = out[..., :states], out[..., states:]
         if belief.raw_std is not None:
             raw = jnp.broadcast_to(belief.raw_std, mean.shape)

@@ -11,7 +11,7 @@ import numpy as np
 from pegasus_jax.math.angles import encode
 from pegasus_jax.math.normalize import whitener
 from pegasus_jax.models._lagrangian_components import GREATEST_CHANGE, GREATEST_SPEED, LEAST_MASS, substituted
-from pegasus_jax.models.noisy import Head, Masks, noisy
+from pegasus_jax.models.noisy import HEADS, Masks, noisy
 from pegasus_jax.sharding import alone_on_gpu
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 
@@ -53,7 +53,6 @@ def lagrangian(
     substeps: int,
     hidden: tuple[int, ...],
     activation: str,
-    head: Head,
     weight_decay: float = 1.0,
     **noise: Any,
 ) -> Dynamics:
@@ -68,6 +67,7 @@ def lagrangian(
     prediction is one std a dimension. `rates` are the entries of x that are rates of the other entries, in the order
     of those; `noise` describes the network, as `noisy` has it.
     """
+    head = HEADS["sigmoid"]
     coordinates = np.array([i for i in range(states) if i not in rates])
     moving = np.array(rates)
     n = len(coordinates)

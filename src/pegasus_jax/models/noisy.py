@@ -37,18 +37,17 @@ def noisy(
     hidden: tuple[int, ...],
     outputs: int,
     dropout: Dropout,
-    input_dropout: Dropout | None = None,
     kl_weight: float = 1.0,
     weight_decay: float = 1.0,
     activation: str = "relu",
     initialiser: str = "glorot",
 ) -> Noisy:
-    """Layer i multiplies its input by noise of `dropout`; the network's own inputs carry `input_dropout`, or none.
+    """Each layer but the first multiplies its input by noise of `dropout`; the network's own inputs carry none.
 
     `kl_weight` and `weight_decay` scale the KL of the noise and the Gaussian weight prior.
     """
     network = MLP(hidden, outputs, initialiser, activation)
-    kinds = (input_dropout, *(dropout for _ in hidden))
+    kinds = (None, *(dropout for _ in hidden))
     widths = (features, *hidden)
 
     def init(key: Key) -> dict[str, Params]:

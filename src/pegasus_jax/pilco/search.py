@@ -101,8 +101,7 @@ def objective(
     """J(theta): the expected cost of the steps 1..H, [H, 1], made one number by `aggregate`."""
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, angles=angles)
     states = propagate(policy_params, belief, start, std, horizon=horizon, noise=noise, **pieces)
-    widened = states.cov[1:] + noise.cost**2 * jnp.diag(std**2)
-    return aggregate(jax.vmap(expected_cost)(states.mean[1:], widened)[:, None])
+    return aggregate(jax.vmap(expected_cost)(states.mean[1:], states.cov[1:])[:, None])
 
 
 def analytic(

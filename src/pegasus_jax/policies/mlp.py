@@ -21,21 +21,16 @@ def mlp(
     saturate: Callable[[Array], Array],
     initialiser: str,
     input_scale: Array | float = 1.0,
-    output_scale: float = 1.0,
 ) -> Policy:
     """u = saturate(network(encode(x) * input_scale)); noise is on each hidden layer's output (docs/reference.md 5.1).
 
     What the data have large is standardised on its way in, see `scaled`.
-    `output_scale` multiplies the last layer's initial weights: how far from the middle of the limits, and how near to
-    saturation, a policy starts.
     """
     network = MLP(hidden, controls, initialiser)
 
     def init(key: Key) -> Params:
         net_key, *keys = jax.random.split(key, 1 + len(hidden))
         net: Any = network.init(net_key, jnp.zeros(features), [None] * (len(hidden) + 1))
-        last = f"layer_{len(hidden)}"
-        net["params"][last]["kernel"] = net["params"][last]["kernel"] * output_scale
         noise = tuple(dropout.init(k, w) for k, w in zip(keys, hidden, strict=True))
         return {"network": net, "noise": noise, "input": unscaled(features)}
 

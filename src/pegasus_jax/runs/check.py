@@ -6,10 +6,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax.tasks import cost_check, user_code
 from pegasus_jax import tasks
 from pegasus_jax.checks import SettingError
 from pegasus_jax.config import Config
+from pegasus_jax.tasks import cost_check, user_code
 from pegasus_jax.types import Task
 
 RESETS = 20  # of an environment that may be reset without need

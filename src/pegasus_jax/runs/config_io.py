@@ -13,13 +13,13 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from pegasus_jax.checks import SettingError, called, nearest, shown
-from pegasus_jax.config import Config
-from pegasus_jax.defaults import BEST, NAMES, defaults
+from pegasus_jax.config import KINDS, TASKS, Config
+from pegasus_jax.presets import WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
-from pegasus_jax.variants import ALGORITHMS, KINDS, MODELS, POLICIES
+from pegasus_jax.runs.removed import refuse, without
 
-# Keys that select a named variant, and what they select from.
-VARIANTS: dict[str, Any] = {"task": NAMES, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
+# Keys that select what a command begins with, and what they select from.
+NAMED: dict[str, Any] = {"task": TASKS, **WORDS}
 
 
 def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, str], dict[str, str]]:
@@ -32,52 +32,48 @@ def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, 
                 raise SettingError(
                     f"'{word}' is not of the form key=value; write no spaces around =, as in task=cartpole"
                 )
-            choices = [*options, *VARIANTS, *leaves(Config())]
+            choices = [*options, *NAMED, *leaves(Config())]
             raise SettingError(f"'{word}' is not of the form key=value; {_hint(word.lstrip('-'), choices)}")
         (known if key in options else rest)[key] = value
     return known, rest
 
 
 def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
-    """The config of a command line: defaults, then the variants' and the task's, then the dotted settings."""
+    """The config of a command line: a preset, the sections that words replace, then the dotted settings."""
     words = _with_arguments(words)
-    chosen = {name: words.pop(name) for name in VARIANTS if name in words}
+    chosen = {name: words.pop(name) for name in NAMED if name in words}
     for name, value in chosen.items():
-        if value not in VARIANTS[name]:
-            raise SettingError(f"{name}={value} is unknown; {nearest(value, VARIANTS[name])}")
-    task, algorithm = chosen.get("task", Config.task), chosen.get("algorithm", "pegasus")
-    # What suits a task best goes with the best algorithm and where no model is named; the rest is the paper's.
-    own = algorithm == "pegasus" and "model" not in chosen
-    best, changes = BEST.get(task, ("log_normal", {})) if own else (chosen.get("model", "log_normal"), {})
-    variants: dict[str, Any] = {
-        **MODELS[best],
-        **changes,
-        **ALGORITHMS[algorithm],
-        **(POLICIES[chosen["policy"]] if "policy" in chosen else {}),
-    }
-    sections = {name: value for name, value in variants.items() if dataclasses.is_dataclass(value)}
-    config = dataclasses.replace(Config(task=task), **sections)
-    config = override(config, values({key: words[key] for key in ("legs",) if key in words}))
-    for changes in (defaults(config.task, config.legs), {k: v for k, v in variants.items() if k not in sections}):
-        there = leaves(config)
-        config = override(config, {key: value for key, value in changes.items() if key in there})
+        if value not in NAMED[name]:
+            raise SettingError(f"{name}={value} is unknown; {nearest(value, NAMED[name])}")
+    given = {key: words[key] for key in ("legs",) if key in words}
+    task, begin = chosen.pop("task", None), chosen.pop("preset", None)
+    if begin is None:
+        task = task or Config.task
+        begin = own(task, override(Config(task=task), values(given)).legs if task in used_by()["legs"] else Config.legs)
+    config = preset(begin, **chosen)
+    if task not in (None, config.task):
+        raise SettingError(f"preset={begin} is for task={config.task}, not task={task}; the nearest is preset={task}")
     known, of_some = leaves(config), used_by()
     for key in words:
+        refuse(key)
         if key not in known:
-            raise SettingError(f"{key} is not a setting; {_hint(key, [*known, *VARIANTS, *options])}")
-        if task not in of_some.get(key, (task,)):
+            raise SettingError(f"{key} is not a setting; {_hint(key, [*known, *NAMED, *options])}")
+        if config.task not in of_some.get(key, (config.task,)):
             raise SettingError(
-                f"{key}={shown(words[key])} is of no use with task={task}; the nearest task that uses it is"
-                f" task={_nearest_of(task, of_some[key])}"
+                f"{key}={shown(words[key])} is of no use with task={config.task}; the nearest task that uses it is"
+                f" task={_nearest_of(config.task, of_some[key])}"
             )
-    return override(config, values(words))
+    changed = override(config, values(words))
+    if changed.legs != config.legs:
+        raise SettingError(f"preset={begin} is for legs={config.legs}; with legs={changed.legs} leave out preset=")
+    return changed
 
 
 def used_by() -> dict[str, tuple[str, ...]]:
     """Setting -> the tasks that use it, of those settings that not every task uses."""
     patterns = {f.name: f.metadata.get("of", ()) for f in dataclasses.fields(Config)}
     return {
-        name: tuple(task for task in NAMES if any(fnmatch(task, pattern) for pattern in of))
+        name: tuple(task for task in TASKS if any(fnmatch(task, pattern) for pattern in of))
         for name, of in patterns.items()
         if of
     }
@@ -102,6 +98,11 @@ def values(words: dict[str, str]) -> dict[str, Any]:
 
 def override(config: Config, changes: dict[str, Any]) -> Config:
     """The config with dotted settings changed, all at once; each value becomes its setting's type, or is refused."""
+    known = leaves(config)
+    for key in changes:
+        refuse(key)
+        if key not in known:
+            raise SettingError(f"{key} is not a setting; {_hint(key, [*known])}")
     return _changed(config, changes, "")
 
 
@@ -129,7 +130,7 @@ def help_lines(node: Any, prefix: str = "") -> list[str]:
         value = getattr(node, f.name)
         if dataclasses.is_dataclass(value):
             lines += help_lines(value, f"{prefix}{f.name}.")
-        elif f"{prefix}{f.name}" not in VARIANTS and f.metadata["help"]:
+        elif f"{prefix}{f.name}" not in NAMED and f.metadata["help"]:
             lines.append(f"  {prefix + f.name + '=' + shown(value):34s} {f.metadata.get('help', '')}")
     return lines
 
@@ -141,28 +142,33 @@ def save(config: Config, path: Path) -> None:
 
 
 def load(path: Path) -> Config:
-    """The config that `save` wrote. Raises SettingError when it is not one.
-
-    A setting that the file lacks is younger than the run, and its default leaves everything as it was.
-    """
+    """The config that `save` wrote. Raises SettingError when it is not one."""
     try:
         stored: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
     except (OSError, ValueError, RecursionError, OmegaConfBaseException, YAMLError) as error:
         raise SettingError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
     if not isinstance(stored, dict) or "task" not in stored:
         raise SettingError(f"{path} is not the config of a run")
+    try:
+        return stored_config({str(key): value for key, value in stored.items()})
+    except SettingError as error:
+        raise SettingError(f"{path}: {error}") from error
+
+
+def stored_config(stored: dict[str, Any]) -> Config:
+    """The config of which `plain` was kept. Raises SettingError for a name or a value that no setting has.
+
+    A setting that is not there is younger than what was kept, and its default leaves everything as it was.
+    """
     chosen = {section: stored.get(f"{section}.kind") for section in KINDS}
     for section, kind in chosen.items():
         if kind not in (None, *KINDS[section]):
-            raise SettingError(f"{path}: {section}.kind={kind} is unknown; {nearest(kind, KINDS[section])}")
+            raise SettingError(f"{section}.kind={kind} is unknown; {nearest(kind, KINDS[section])}")
     config = Config(**{section: KINDS[section][kind] for section, kind in chosen.items() if kind is not None})
-    wrong = sorted(set(map(str, stored)) - set(leaves(config)))
-    if wrong:
-        raise SettingError(f"{path} is not the config of a run of this version: see {', '.join(wrong[:5])}")
-    try:
-        return override(config, stored)
-    except SettingError as error:
-        raise SettingError(f"{path}: {error}") from error
+    stored = without(stored)
+    if wrong := sorted(set(stored) - set(leaves(config))):
+        raise SettingError(f"not the config of a run of this version: see {', '.join(wrong[:5])}")
+    return override(config, stored)
 
 
 def _hint(key: str, choices: Sequence[str]) -> str:

@@ -15,8 +15,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 
-from pegasus_jax.config import Config
-from pegasus_jax.defaults import label
+from pegasus_jax.config import Config, label
 
 # A phase, and what it is called. A trial that begins with `read` finds its episode on disk, for example after a kill.
 PHASES = {

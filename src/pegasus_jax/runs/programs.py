@@ -235,7 +235,8 @@ def over_seeds(
     `axes` is 0 for an argument with that axis, None for one that all seeds share. With a mesh the seeds are shared out.
     """
     if over is not None and over.shape[sharding.PARTICLES] == 1:
-        return sharding.each_its_own(over_seeds(function, axes, seeds=seeds // over.shape[sharding.SEEDS]), over, axes, 0)
+        each = over_seeds(function, axes, seeds=seeds // over.shape[sharding.SEEDS])
+        return sharding.each_its_own(each, over, axes, 0)
     if seeds > 1:
         return jax.vmap(function, axes, spmd_axis_name=sharding.SEEDS)
 

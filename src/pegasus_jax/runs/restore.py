@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax.runs import checkpoint, facts, store, config_io
 from pegasus_jax import tasks
 from pegasus_jax.builder import compose, set_precision
 from pegasus_jax.checks import RunError, SettingError
 from pegasus_jax.config import Config
 from pegasus_jax.episode import verdict
+from pegasus_jax.runs import checkpoint, config_io, facts, store
 from pegasus_jax.types import Experiment, Learner, RunState, Task
 
 Trial = int | str  # a number, or one of:

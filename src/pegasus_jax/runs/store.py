@@ -24,8 +24,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pegasus_jax.runs import facts
 from pegasus_jax.checks import RunError, SettingError
+from pegasus_jax.runs import facts
 from pegasus_jax.runs.files import strict, write_json, write_whole
 from pegasus_jax.runs.machine import about
 

@@ -13,17 +13,17 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
-from pegasus_jax.runs import checkpoint, store, restore, config_io
 from pegasus_jax import episode, interrupt, tasks
-from pegasus_jax.tasks import user_code
-from pegasus_jax.runs.tensorboard import Board
 from pegasus_jax.builder import build, set_precision
 from pegasus_jax.checks import RunError, SettingError
 from pegasus_jax.config import Config
-from pegasus_jax.learn.data import grow
-from pegasus_jax.runs.programs import Program, fetched, leads
-from pegasus_jax.runs.display import Display, summary
 from pegasus_jax.experiment import COLLECT, EVALUATE, trial_key
+from pegasus_jax.learn.data import grow
+from pegasus_jax.runs import checkpoint, config_io, restore, store
+from pegasus_jax.runs.display import Display, summary
+from pegasus_jax.runs.programs import Program, fetched, leads
+from pegasus_jax.runs.tensorboard import Board
+from pegasus_jax.tasks import user_code
 from pegasus_jax.types import Episode, Experiment, Key, Params, RunState, Task, Trajectory
 
 # What `improved` says of a trial that has not improved anything.

@@ -15,8 +15,7 @@ import numpy as np
 from pegasus_jax import sharding
 from pegasus_jax.builder import build, set_precision
 from pegasus_jax.checks import SIZES, SettingError
-from pegasus_jax.config import Config
-from pegasus_jax.defaults import GYM
+from pegasus_jax.config import GYM, Config
 from pegasus_jax.episode import succeeded
 from pegasus_jax.experiment import TrialInfo, trial
 from pegasus_jax.runs import config_io

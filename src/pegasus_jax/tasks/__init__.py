@@ -12,8 +12,7 @@ import numpy as np
 
 from pegasus_jax import interrupt
 from pegasus_jax.checks import SettingError, nearest
-from pegasus_jax.config import Config
-from pegasus_jax.defaults import GYM, MANOEUVRES, MJCF
+from pegasus_jax.config import GYM, MANOEUVRES, MJCF, Config
 from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
 from pegasus_jax.tasks import user_code
 from pegasus_jax.types import Task

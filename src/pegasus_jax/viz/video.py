@@ -39,11 +39,11 @@ class Strip(NamedTuple):
 
 def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.LAST, mjcf: str | None = None) -> Path:
     """Write RUN/play.mp4: `episodes` episodes that are not data, one after the other, in real time."""
-    config, experiment, state = restore.ready(run, trial, mjcf)
-    task, mean = experiment.task, config.policy.execution == "mean"
+    _, experiment, state = restore.ready(run, trial, mjcf)
+    task = experiment.task
     if not hasattr(task.plant, "glide"):
         raise RunError(f"{run} learned {task.name}; only plants in JAX can be filmed")
-    perform = jax.jit(partial(performance, task=task, policy=experiment.policy, mean=mean))
+    perform = jax.jit(partial(performance, task=task, policy=experiment.policy))
     path, writer = run / "play.mp4", None
     # A folder of its own beside: ffmpeg opens no file that was there, and what was at `path`, a link too, is replaced.
     with TemporaryDirectory(dir=run, prefix=".play.") as folder:
@@ -64,11 +64,11 @@ def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.LAS
     return path
 
 
-def performance(key: Key, params: Params, *, task: Task, policy: Policy, mean: bool) -> tuple[Trajectory, Any]:
+def performance(key: Key, params: Params, *, task: Task, policy: Policy) -> tuple[Trajectory, Any]:
     """One episode of a policy, and the plant's states on the way [H, n, ...], n a control period."""
 
     def act(key: Key, t: Array, x: Array) -> Array:
-        return policy.apply(params, None if mean else policy.sample(key), x)
+        return policy.apply(params, policy.sample(key), x)
 
     return episode.watch(key, act, task, task.plant.glide)
 

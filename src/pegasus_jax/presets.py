@@ -1,0 +1,223 @@
+"""The presets: whole configs, a value each, and the words that change whole sections of one.
+
+A command begins with a preset, its task's own or the one that `preset=` names. `model=`, `algorithm=` and `policy=`
+change it in this order; single keys come last. Imports neither JAX nor a simulator, so that a command says
+what it will do before it waits for them.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.config import (
+    BNN,
+    GP,
+    GYM,
+    LBFGS,
+    MANOEUVRES,
+    MJCF,
+    MLP,
+    RBF,
+    SSGP,
+    Analytic,
+    Config,
+    Explore,
+    Fit,
+    Lagrangian,
+    Linear,
+    Period,
+    Search,
+)
+
+# Of a mechanism's integration, where a task needs others than most: docs/decisions/0009.
+_SUBSTEPS = {"cartpole": 1}  # its pole never turns fast enough for two to matter
+
+CARTPOLE = Config(
+    task="cartpole",
+    model=Lagrangian(substeps=_SUBSTEPS["cartpole"]),
+    fit=Fit(steps=3000, learning_rate=3e-3),
+    search=Search(widen=2.0, balanced=True, refine=0.5),  # docs/decisions/0014 and 0015
+)
+
+# docs/decisions/0006, 0008, 0009 and 0011.
+DOUBLE_CARTPOLE = Config(
+    task="double_cartpole",
+    trials=40,
+    model=Lagrangian(substeps=4),
+    policy=MLP(hidden=(50,) * 4, input_units=(1.0, 3.0, 6.0, 8.0)),
+    fit=Fit(steps=5000, learning_rate=3e-3, decay=0.03),
+    search=Search(
+        steps=600,
+        learning_rate=3e-3,
+        decay=0.03,
+        match=False,
+        cost="particles",
+        anneal=14,
+        reheat=0.17,
+        limit=1.0,
+        loosen=30.0,
+        sensors="known",
+    ),
+    explore=Explore(trials=4, kind="walk"),
+)
+
+# docs/reference.md 2.2: the paper's networks, dropout and step size.
+DOUBLE_CARTPOLE_NETWORK = Config(
+    task="double_cartpole",
+    trials=40,
+    model=BNN(hidden=(200,) * 4),
+    policy=MLP(hidden=(50,) * 4, dropout=0.1),
+    search=Search(learning_rate=1e-4),
+    explore=Explore(trials=2),
+)
+
+
+def swimmer(manoeuvre: str, legs: int, learning_rate: float = 1e-4) -> Config:
+    """docs/reference.md 3.4 with five networks (docs/decisions/0017); the policy's dropout is the paper's .1."""
+    return Config(
+        task=f"swimmer_{manoeuvre}",
+        legs=legs,
+        trials=50,
+        model=BNN(hidden=(200,) * 4, initialiser="orthogonal", members=5, kl_weight=1.0),
+        policy=MLP(hidden=(200,) * 4, dropout=0.1, initialiser="orthogonal"),
+        fit=Fit(steps={2: 2000, 6: 4000}[legs]),
+        search=Search(
+            steps=500,
+            particles={2: 400, 6: 500}[legs],
+            learning_rate=learning_rate,
+            cost="particles",  # so it was measured
+            widen=1.0,
+            balanced=True,
+            refine=0.5,
+            anew=True,  # docs/decisions/0016
+        ),
+        explore=Explore(trials=5, kind="walk"),
+    )
+
+
+# A cost of one's own has no width to widen; its expectation is a mean over nodes: docs/decisions/0018.
+_OWN_COST = Search(widen=1.0, balanced=True, refine=0.5)
+
+_SWIMMERS = {
+    **{f"swimmer_{name}": swimmer(name, 2, 1e-3 if name == "depth_change" else 1e-4) for name in MANOEUVRES},
+    **{f"swimmer_{name}_six_legs": swimmer(name, 6) for name in MANOEUVRES},
+}
+
+# With a Bayesian neural network as the paper has it: what `model=` and the paper's algorithms change.
+NETWORKS: dict[str, Config] = {
+    "cartpole_network": replace(CARTPOLE, model=BNN(), fit=Fit()),
+    "double_cartpole_network": DOUBLE_CARTPOLE_NETWORK,
+    **{
+        f"{name}_network": replace(config, model=replace(config.model, members=1, kl_weight=BNN.kl_weight))
+        for name, config in _SWIMMERS.items()
+    },
+}
+
+PRESETS: dict[str, Config] = {
+    "cartpole": CARTPOLE,
+    "double_cartpole": DOUBLE_CARTPOLE,
+    "double_cartpole_gpu": replace(  # eight policies side by side: docs/decisions/0010
+        DOUBLE_CARTPOLE,
+        fit=replace(DOUBLE_CARTPOLE.fit, steps=3000),
+        search=replace(DOUBLE_CARTPOLE.search, starts=8, particles=96, steps=2000),
+    ),
+    **_SWIMMERS,
+    # A robot runs a new policy only where it is expected to be better than the one before.
+    GYM: Config(task=GYM, search=_OWN_COST, successor="better"),
+    MJCF: Config(task=MJCF, search=_OWN_COST),
+    **NETWORKS,
+}
+
+Change = Callable[[Config], Config]
+
+
+def _network(**changes: Any) -> Change:
+    return lambda config: replace(config, model=replace(config.model, **changes))
+
+
+def _lagrangian(config: Config) -> Config:
+    assert isinstance(config.model, BNN)
+    model = Lagrangian(initialiser=config.model.initialiser, substeps=_SUBSTEPS.get(config.task, Lagrangian.substeps))
+    return replace(config, model=model, fit=Fit(steps=3000, learning_rate=3e-3))
+
+
+def _dropout(rate: float) -> Change:
+    return lambda config: replace(config, policy=replace(config.policy, dropout=rate))
+
+
+# Each changes a preset with a network.
+MODELS: dict[str, Change] = {
+    "log_normal": lambda config: config,
+    "binary": _network(dropout="binary"),
+    "concrete": _network(dropout="concrete"),
+    "gaussian": _network(dropout="gaussian"),
+    "sparse": _network(dropout="sparse"),
+    "deterministic": _network(dropout="none"),
+    "ensemble": _network(dropout="none", members=5),
+    "lagrangian": _lagrangian,
+    "gp": lambda config: replace(config, model=GP(), fit=LBFGS(starts=10)),
+    "ssgp": lambda config: replace(config, model=SSGP(), fit=LBFGS()),
+}
+POLICIES: dict[str, Change] = {
+    "mlp": _dropout(0.0),
+    "dropout_mlp": _dropout(0.1),
+    "rbf": lambda config: replace(config, policy=RBF()),
+    "rbf100": lambda config: replace(config, policy=RBF(units=100)),
+    "linear": lambda config: replace(config, policy=Linear()),
+}
+
+
+def _papers(config: Config, **search: Any) -> Config:
+    """The paper's network, dropout in the policy and step size of the fit, with a search that follows each particle."""
+    model, fit = config.model, config.fit
+    if isinstance(model, BNN | Lagrangian):
+        model = replace(model, activation="relu", kl_weight=1.0)
+    if isinstance(fit, Fit):
+        fit = replace(fit, learning_rate=1e-4)
+    plain = dict(cost="particles", widen=1.0, balanced=False, refine=0.0, restart=False, anew=False)
+    changed = replace(config.search, **plain, **search)
+    return replace(_dropout(0.1)(config), model=model, fit=fit, search=changed)
+
+
+ALGORITHMS: dict[str, Change] = {
+    "pegasus": lambda config: config,  # what learned best (docs/decisions)
+    # Alg. 3 as printed: all draws but the start particles held for a whole search.
+    "paper": lambda config: _papers(config, reset=False, period=Period(1, 0, 0, 0, 0)),
+    # Alg. 2: everything redrawn every iteration, no clipping.
+    "deep_pilco": lambda config: _papers(config, particles=10, clip=None, period=Period(dynamics=1)),
+    "pilco": lambda config: replace(config, search=Analytic(particles=config.search.particles), precision="double"),
+}
+
+WORDS = {"preset": PRESETS, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
+
+
+def preset(
+    name: str = "cartpole", *, model: str | None = None, policy: str | None = None, algorithm: str | None = None
+) -> Config:
+    """What a command with these words begins with: preset("cartpole") is the config of pegasus-train task=cartpole.
+
+    `model`, `policy` and `algorithm` are the command line's words. A named model, and every algorithm but "pegasus",
+    change the preset NAME_network where there is one: what was tuned for a preset's own model says nothing of another.
+    Raises SettingError for an unknown word, in one line with the nearest one.
+    """
+    said = {"preset": name, "model": model, "policy": policy, "algorithm": algorithm}
+    for word, value in said.items():
+        if value is not None and value not in WORDS[word]:
+            raise SettingError(f"{word}={value} is unknown; {nearest(value, WORDS[word])}")
+    config = PRESETS[name if model is None and algorithm in (None, "pegasus") else network(name)]
+    for change in (MODELS[model or "log_normal"], ALGORITHMS[algorithm or "pegasus"]):
+        config = change(config)
+    return POLICIES[policy](config) if policy else config
+
+
+def network(name: str) -> str:
+    """The preset of the same task, and as many legs, that has a network."""
+    of = PRESETS[name]
+    same = (one for one, config in NETWORKS.items() if (config.task, config.legs) == (of.task, of.legs))
+    return name if name in NETWORKS else next(same, name)
+
+
+def own(task: str, legs: int = 2) -> str:
+    """The name of the preset that a task begins with, for a swimmer by the legs that it drives."""
+    return f"{task}_six_legs" if legs == 6 else task
