@@ -17,8 +17,8 @@ from pegasus_jax import tasks
 from pegasus_jax.builder import blocks_of, compose
 from pegasus_jax.config import Config
 from pegasus_jax.imagine import costs, matching
+from pegasus_jax.imagine.objective import objective
 from pegasus_jax.imagine.scenarios import draw
-from pegasus_jax.learn.search import objective
 from pegasus_jax.math.angles import encode
 from pegasus_jax.runs import config_io
 from pegasus_jax.types import Array, Experiment, Params, Period, RunState, Scenarios, Task, Trajectory

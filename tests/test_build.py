@@ -264,7 +264,7 @@ def test_the_settings_of_pilcos_search_reach_its_objective():
         chosen = dataclasses.replace(ANALYTIC, **{"policy_noise": 0.0, "state_noise": 0.0, **search})
         searcher, _ = search_of(chosen, task, dynamics, policy)
         params = jnp.full((1, 2), -0.5)
-        run = jax.jit(partial(searcher.run, first=0, steps=1))
+        run = jax.jit(partial(searcher.run, first=0, steps=1, fresh=params))
         return float(run(jax.random.key(0), Learner(params, searcher.init(params)), None)[1].objective[0])
 
     of_cart = partial(value, cart(horizon=3))

@@ -7,7 +7,6 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 from jax.flatten_util import ravel_pytree
 
@@ -18,8 +17,8 @@ from pegasus_jax.config import Period
 from pegasus_jax.experiment import SEARCH, trial_key
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching, scenarios
+from pegasus_jax.imagine.objective import objective
 from pegasus_jax.learn.fit import falling
-from pegasus_jax.learn.search import objective
 from pegasus_jax.types import Dataset, Learner
 from probes import PENDULUM, cart, known, linear_policy, tiny
 
@@ -173,7 +172,7 @@ def test_a_refining_search_in_parts_is_the_whole():
         parts, _ = part(parts, first)
     whole = run(state)[0].policy
     np.testing.assert_allclose(parts.policy.params, whole.params, rtol=1e-6)
-    assert all(optax.tree.get(learner.optimizer, "stale") for learner in (parts.policy, whole))
+    assert all(learner.optimizer.no_improvement for learner in (parts.policy, whole))
 
 
 def test_what_is_weighed_needs_no_second_program(monkeypatch):
@@ -332,7 +331,7 @@ def test_clipping_reaches_the_optimiser():
     for clip in (None, 1e-6):
         _, state, run = searcher(clip=clip)
         state, info = run(state)
-        moved[clip] = float(jnp.linalg.norm(state.policy.optimizer.inner_state[1][0].mu))
+        moved[clip] = float(jnp.linalg.norm(state.policy.optimizer.optimizer[1][0].mu))
         assert info.gradient_norm[0] > 1e-4
     np.testing.assert_allclose(moved[None], 0.1 * info.gradient_norm[0], rtol=1e-3)
     np.testing.assert_allclose(moved[1e-6], 0.1 * 1e-6, rtol=1e-3)

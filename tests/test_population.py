@@ -95,7 +95,7 @@ def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_
         searcher = best_of(descent(), fresh, starts=STARTS, window=1, lasting=lasting)
         learner = Learner(jnp.float32(0.3), searcher.init(jnp.float32(0.3)))
         first, _ = searcher.run(jax.random.key(0), learner, DEEPER, first=0, earlier=0, steps=3)
-        second, _ = searcher.run(jax.random.key(1), first, DEEPER, first=0, earlier=3, steps=3)
+        second, _ = searcher.run(jax.random.key(1), first, DEEPER, first=0, earlier=1, steps=3)
         return first, second
 
     begun = jax.vmap(lambda own: descent().run(None, Learner(own, descent().init(own)), DEEPER, first=0, steps=3)[0])

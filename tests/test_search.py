@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 from pegasus_jax.imagine import costs, matching, scenarios
+from pegasus_jax.imagine.objective import objective
 from pegasus_jax.imagine.rollout import NoiseUse
-from pegasus_jax.learn.fit import guarded
-from pegasus_jax.learn.schedule import Course, narrowing
-from pegasus_jax.learn.search import keeping_best, objective, optimise, remembering, started
-from pegasus_jax.types import Learner, Period, Scenarios, Searcher
+from pegasus_jax.learn.schedule import search_table
+from pegasus_jax.learn.search import Problem, Sampler, gradient_search, sampler, searcher
+from pegasus_jax.types import Learner, Period, Scenarios
 from probes import (
     EMITTERS,
     PENDULUM,
@@ -91,7 +91,7 @@ def test_the_gradient_equals_finite_differences(x64):
 
 
 def linear_objective(plant, particles):
-    """gain -> objective under exactly balanced noise, and the pieces `optimise` wants."""
+    """gain -> objective under exactly balanced noise, and how its scenarios are drawn."""
     dynamics, policy = known(plant), linear_policy(*plant.b.shape)
     blocks = scenarios.blocks(
         dynamics=dynamics,
@@ -136,17 +136,15 @@ def test_matched_balanced_particles_give_the_exact_expected_cost(plant, x64):
 def test_the_search_finds_the_best_gain(plant):
     particles = 12
     value, blocks = linear_objective(plant, particles)
-    pieces = dict(blocks=blocks, period=Period())
     # The unstable start gives large gradients, which Adam must forget: hence b2.
     adam = optax.adam(optax.cosine_decay_schedule(0.1, 800), b2=0.95)
-    optimizer = guarded(optax.chain(optax.clip_by_global_norm(1.0), adam))
+    optimizer = optax.chain(optax.clip_by_global_norm(1.0), adam)
     gain = jnp.zeros(plant.b.T.shape)
     search = jax.jit(
         partial(
-            optimise,
-            draw=partial(scenarios.draw, **pieces),
-            redraw=partial(scenarios.redraw, **pieces),
+            gradient_search,
             objective=value,
+            sampler=sampler(blocks, Period()),
             optimizer=optimizer,
             steps=800,
         )
@@ -168,13 +166,12 @@ def test_a_known_control_is_found_through_limits_and_costs():
     cost_of = lambda u: task.cost(task.plant.step(start, u))  # noqa: E731
     grid = np.linspace(-2, 2, 4001, dtype=np.float32)[:, None]
     best = grid[np.argmin(jax.vmap(cost_of)(grid))]
-    optimizer = guarded(optax.adam(0.05))
-    learner, _ = optimise(
+    optimizer = optax.adam(0.05)
+    learner, _ = gradient_search(
         jax.random.key(0),
         Learner(jnp.zeros(1), optimizer.init(jnp.zeros(1))),
         None,
-        draw=lambda key, step, belief: None,
-        redraw=lambda key, step, held, belief: held,
+        sampler=Sampler(lambda *_: jnp.zeros(()), lambda key, step, held, belief: held),
         objective=lambda params, belief, given: cost_of(2 * jnp.tanh(params)),
         optimizer=optimizer,
         steps=200,
@@ -203,9 +200,8 @@ def pursue(optimizer, steps, *, bad=(), value=jnp.nan, scale=1.0):
 
     return jax.jit(
         partial(
-            optimise,
-            draw=draw,
-            redraw=lambda key, step, held, belief: draw(key, step, belief),
+            gradient_search,
+            sampler=Sampler(draw, lambda key, step, held, belief: draw(key, step, belief)),
             objective=distance,
             optimizer=optimizer,
             steps=steps,
@@ -228,7 +224,7 @@ def loop(optimizer, iterations):
 
 
 def test_the_search_is_gradient_descent_on_the_scenarios_of_each_iteration():
-    optimizer = guarded(optax.adam(0.1))
+    optimizer = optax.adam(0.1)
     learner, info = pursue(optimizer, 6)(jax.random.key(7), begin(optimizer), 1.0)
     expected = loop(optimizer, range(6))
     np.testing.assert_allclose(learner.params, expected.params, rtol=1e-5)
@@ -238,14 +234,27 @@ def test_the_search_is_gradient_descent_on_the_scenarios_of_each_iteration():
     np.testing.assert_allclose(info.gradient_norm[0], 2 * np.sqrt(first), rtol=1e-5)
 
 
+def on_table(table, optimizer, draw=follow, value=distance, **more):
+    """(searcher of a table, its learner at ones); the objective ignores the row unless `value` takes it."""
+    drawing = Sampler(draw, lambda key, step, held, belief: draw(key, step, belief))
+    found = searcher(Problem(value, drawing, optimizer, table, **more))
+    return found, Learner(jnp.ones(3), found.init(jnp.ones(3)))
+
+
+def rowless(params, belief, target, row):
+    return distance(params, belief, target)
+
+
+STILL = lambda *_: jnp.zeros(3)  # noqa: E731
+
+
 @pytest.mark.parametrize("calls", [1, 2, 3])
-def test_a_search_that_loses_what_it_found_ends_with_what_it_had_at_its_turn(calls):
+def test_a_search_that_loses_what_it_found_ends_with_what_it_had_before_it_refined(calls):
     """Three steps find something better than what was given, three of ten thousand times the size lose it again."""
-    optimizer = guarded(started(optax.sgd(0.1)))
-    course = Course(turns=(3, 6), pace=lambda i: jnp.where(i < 3, 1.0, 1e4))
-    still = dict(draw=lambda *_: jnp.zeros(3), redraw=lambda key, step, held, belief: held, optimizer=optimizer)
-    run = jax.jit(partial(optimise, **still, objective=distance, course=course, steps=6 // calls))
-    learner, values = begin(optimizer), []
+    table = search_table(6, refine=3)
+    table = table._replace(step_size=np.where(table.refine, 1e4, 1.0)[None])
+    found, learner = on_table(table, optax.sgd(0.1), STILL, rowless)
+    run, values = jax.jit(partial(found.run, steps=6 // calls)), []
     for call in range(calls):
         learner, info = run(jax.random.key(7), learner, 1.0, first=call * (6 // calls))
         values += info.objective.tolist()
@@ -253,51 +262,86 @@ def test_a_search_that_loses_what_it_found_ends_with_what_it_had_at_its_turn(cal
     np.testing.assert_allclose(values[:4], 3 * np.power(0.64, [0, 1, 3, 3]), rtol=1e-5)
     assert values[4] > 1e6
     np.testing.assert_allclose(values[5], values[3], rtol=1e-5)
+    assert not learner.optimizer.no_improvement
+
+
+@pytest.mark.parametrize(
+    ("own", "other", "stuck", "taken"),
+    [(2, 1, False, True), (1, 2, False, False), (1, 1, False, True), (1, np.nan, False, False), (1, 2, True, True)],
+)
+def test_a_fresh_policy_is_taken_where_it_costs_no_more_or_the_last_search_found_nothing(own, other, stuck, taken):
+    """Of two equal ones the fresh one, because a flat cost leads nowhere; what is not a number never."""
+    found, learner = on_table(search_table(1, init="better"), optax.sgd(0.0), STILL, rowless)
+    state = learner.optimizer._replace(no_improvement=jnp.asarray(stuck))
+    learner = Learner(jnp.full(3, float(own)), state)
+    after, info = found.run(jax.random.key(0), learner, 1.0, steps=1, fresh=jnp.full(3, float(other)))
+    assert np.array_equal(after.params, np.full(3, other if taken else own))
+    np.testing.assert_allclose(info.objective, 3 * float(other if taken else own) ** 2)
+
+
+def test_a_fresh_policy_that_a_table_needs_and_iterations_that_it_lacks_are_errors():
+    found, learner = on_table(search_table(2, init="fresh"), optax.sgd(0.1), STILL, rowless)
+    with pytest.raises(ValueError, match="fresh= is None; expected its parameters"):
+        found.run(jax.random.key(0), learner, 1.0, steps=1)
+    with pytest.raises(ValueError, match="steps=3: the table of this search has 2"):
+        found.run(jax.random.key(0), learner, 1.0, steps=3, fresh=jnp.zeros(3))
+
+
+def test_a_new_search_forgets_the_moments_or_goes_on_with_them():
+    for reset in (True, False):
+        found, learner = on_table(search_table(3), optax.adam(0.1), value=rowless, reset=reset)
+        once, _ = found.run(jax.random.key(7), learner, 1.0, steps=3)
+        twice, _ = found.run(jax.random.key(7), once, 1.0, steps=3)
+        assert twice.optimizer.optimizer[0].count == (3 if reset else 6)
 
 
 def test_each_iteration_has_its_width_wherever_the_search_is_cut():
-    optimizer = guarded(remembering(optax.adam(0.1)))
-    pieces = dict(draw=follow, redraw=lambda key, step, held, belief: follow(key, step, belief), optimizer=optimizer)
-    value = lambda *given: distance(*given[:3]) / given[3]  # noqa: E731
-    run = partial(optimise, **pieces, course=Course(stage=narrowing(4.0, 3), settled=3), objective=value)
-    whole, info = run(jax.random.key(7), begin(optimizer), 1.0, steps=6)
-    half, _ = run(jax.random.key(7), begin(optimizer), 1.0, steps=2)
-    rest, last = run(jax.random.key(7), half, 1.0, steps=4, first=2)
+    value = lambda *given: distance(*given[:3]) / given[3].cost_width  # noqa: E731
+    found, learner = on_table(search_table(6, widen=4.0), optax.adam(0.1), value=value)
+    whole, info = found.run(jax.random.key(7), learner, 1.0, steps=6)
+    half, _ = found.run(jax.random.key(7), learner, 1.0, steps=2)
+    rest, last = found.run(jax.random.key(7), half, 1.0, steps=4, first=2)
     np.testing.assert_allclose(rest.params, whole.params, rtol=1e-5)
     np.testing.assert_allclose(last.objective, info.objective[2:], rtol=1e-5)
     first = distance(jnp.ones(3), 1.0, follow(jax.random.key(7), 0, None))
     np.testing.assert_allclose(info.objective[0], first / 4, rtol=1e-6)
-    best = optax.tree.get(whole.optimizer, "best_value")
-    assert best == info.objective[3:].min(), "values of a wider cost do not count"
+
+
+def test_the_table_search_skips_and_counts_bad_gradients_as_the_plain_one_does():
+    draw = lambda key, step, belief: jnp.where(step == 2, jnp.nan, follow(key, step, belief))  # noqa: E731
+    found, learner = on_table(search_table(5), optax.adam(0.1), draw, rowless)
+    ours, info = found.run(jax.random.key(7), learner, 1.0, steps=5)
+    plain, expected = pursue(optax.adam(0.1), 5, bad=(2,))(jax.random.key(7), begin(optax.adam(0.1)), 1.0)
+    np.testing.assert_allclose(ours.params, plain.params, rtol=1e-6)
+    assert info.skipped == expected.skipped == 1
+    assert np.array_equal(np.isnan(info.objective), np.isnan(expected.objective))
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_bad_gradient_skips_its_update_and_nothing_else(value):
     """Parameters and optimiser state are those of a search that never had these iterations."""
-    optimizer = guarded(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.1)))
+    optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.1))
     learner, info = pursue(optimizer, 8, bad=(2, 3, 6), value=value)(jax.random.key(7), begin(optimizer), 1.0)
     expected = loop(optimizer, [0, 1, 4, 5, 7])
     np.testing.assert_allclose(learner.params, expected.params, rtol=1e-5)
-    for ours, theirs in zip(
-        jax.tree.leaves(learner.optimizer.inner_state), jax.tree.leaves(expected.optimizer.inner_state), strict=True
-    ):
+    for ours, theirs in zip(jax.tree.leaves(learner.optimizer), jax.tree.leaves(expected.optimizer), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-5)
     assert info.skipped == 3
     assert np.array_equal(np.isfinite(info.gradient_norm), [1, 1, 0, 0, 1, 1, 0, 1])
 
 
 def test_a_search_that_sees_nothing_but_bad_gradients_changes_nothing():
-    optimizer = guarded(optax.adam(0.1))
+    optimizer = optax.adam(0.1)
     learner, info = pursue(optimizer, 5, bad=tuple(range(5)))(jax.random.key(7), begin(optimizer), 1.0)
     assert np.array_equal(learner.params, np.ones(3))
-    assert same(learner.optimizer.inner_state, begin(optimizer).optimizer.inner_state)
+    assert same(learner.optimizer, begin(optimizer).optimizer)
     assert info.skipped == 5
     _, info = pursue(optimizer, 5)(jax.random.key(7), learner, 1.0)
     assert info.skipped == 0  # each call counts its own
 
 
 def test_clipping_limits_the_update_and_keeps_its_direction():
-    optimizer = guarded(optax.chain(optax.clip_by_global_norm(0.5), optax.sgd(1.0)))
+    optimizer = optax.chain(optax.clip_by_global_norm(0.5), optax.sgd(1.0))
     for scale in (1e-2, 1e3):
         learner, info = pursue(optimizer, 1, scale=0.0)(jax.random.key(7), begin(optimizer), scale)
         gradient = 2 * scale * np.ones(3)
@@ -318,69 +362,25 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
         horizon=4,
         balanced=False,
     )
-    pieces = dict(blocks=blocks, period=Period(start=1, sensor=3))  # redrawn inside a piece and across two
+    draws = sampler(blocks, Period(start=1, sensor=3))  # redrawn inside a piece and across two
     value = partial(
         objective, dynamics=dynamics, policy=policy, match=matching.match, cost=costs.of_particles(task.cost)
     )
-    optimizer = guarded(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.01)))
-
-    def search(steps):
-        draws = {name: partial(getattr(scenarios, name), **pieces) for name in ("draw", "redraw")}
-        function = partial(optimise, **draws, objective=value, optimizer=optimizer, steps=steps)
-        return jax.jit(function, compiler_options=EMITTERS)
-
+    optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.01))
+    found = searcher(Problem(lambda *given: value(*given[:3]), draws, optimizer, search_table(6)))
+    compiled = partial(jax.jit, compiler_options=EMITTERS)
     key, belief = jax.random.key(3), jnp.full((3, 2), 0.2)
     params = jnp.full((1, 2), 0.3)
-    learner = Learner(params, optimizer.init(params))
-    whole, info = search(6)(key, learner, belief)
-    part, values = search(2), []
+    begins = learner = Learner(params, found.init(params))
+    whole, info = compiled(partial(found.run, steps=6))(key, learner, belief)
+    part, values = compiled(partial(found.run, steps=2)), []
     for first in (0, 2, 4):
         learner, chunk = part(key, learner, belief, first=first)
         values.append(chunk.objective)
     assert same(whole, learner)
     assert np.array_equal(info.objective, np.concatenate(values))
     assert len(np.unique(info.objective)) == 6
-
-
-# The best iterate
-
-
-def seeking(optimizer, steps, value=jnp.nan, bad=(), last=12):
-    """A keeping searcher around `pursue`."""
-    init, run = optimizer.init, pursue(optimizer, steps, bad=bad, value=value)
-    searcher = Searcher(init, lambda key, learner, belief, *, first, steps: run(key, learner, belief, first=first))
-    return keeping_best(searcher, last)
-
-
-def test_the_best_iterate_is_the_one_with_the_lowest_objective_seen():
-    """One that is not the last; a search in pieces keeps the same one; NaN is no value."""
-    key = jax.random.key(7)
-    plain, remembers = guarded(optax.adam(0.3)), guarded(remembering(optax.adam(0.3)))
-    one, learner, params, values = pursue(plain, 1), begin(plain), [], []
-    for i in range(12):
-        params.append(learner.params)
-        learner, info = one(key, learner, 1.0, first=i)
-        values.append(float(info.objective[0]))
-    best = int(np.argmin(values))
-    assert 0 < best < 11
-    whole, _ = seeking(remembers, 12).run(key, begin(remembers), 1.0, first=0, steps=12)
-    np.testing.assert_allclose(whole.params, params[best], rtol=1e-5)
-    learner = begin(remembers)
-    for first in (0, 4, 8):
-        learner, _ = seeking(remembers, 4).run(key, learner, 1.0, first=first, steps=4)
-        if first < 8:  # not over: the search goes on from where it is
-            np.testing.assert_allclose(learner.params, params[first + 4], rtol=1e-4)
-    assert same(learner, whole)
-    spoiled, info = seeking(remembers, 12, bad=(best,)).run(key, begin(remembers), 1.0, first=0, steps=12)
-    assert np.isnan(info.objective[best])
-    assert np.all(np.isfinite(spoiled.params))
-    assert not np.allclose(spoiled.params, whole.params)
-
-
-def test_what_was_best_for_an_older_model_is_forgotten():
-    remembers = guarded(remembering(optax.adam(0.3)))
-    searcher = seeking(remembers, 12)
-    learner, _ = searcher.run(jax.random.key(7), begin(remembers), 1.0, first=0, steps=12)
-    start = learner.params + 3
-    again, info = searcher.run(jax.random.key(8), Learner(start, learner.optimizer), 1e3, first=0, steps=12)
-    assert float(optax.tree.get(again.optimizer, "best_value")) == np.min(info.objective)
+    # Alg. 3 as printed is the table of nothing but steps.
+    printed = partial(gradient_search, objective=value, sampler=draws, optimizer=optimizer, steps=6)
+    plain, expected = compiled(printed)(key, Learner(params, begins.optimizer.optimizer), belief)
+    assert same((plain.params, plain.optimizer, expected), (whole.params, whole.optimizer.optimizer, info))

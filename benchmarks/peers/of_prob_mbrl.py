@@ -32,8 +32,8 @@ from benchmarks.peers.plain_torch import Layers
 from benchmarks.workloads import Workload, goal
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching
+from pegasus_jax.imagine.objective import objective
 from pegasus_jax.imagine.rollout import NoiseUse
-from pegasus_jax.learn.search import objective
 from pegasus_jax.math.angles import encode
 
 Tensors = Callable[[Any], Tensor]

@@ -14,12 +14,22 @@ if TYPE_CHECKING:
     from pegasus_jax.config import Config
     from pegasus_jax.experiment import TrialInfo, run, trial
     from pegasus_jax.imagine import costs, matching
+    from pegasus_jax.imagine.objective import objective
     from pegasus_jax.imagine.rollout import NoiseUse, rollout
     from pegasus_jax.imagine.scenarios import Blocks, blocks, draw
     from pegasus_jax.learn import data
     from pegasus_jax.learn.fit import FitInfo, fit, minibatches
-    from pegasus_jax.learn.schedule import Course
-    from pegasus_jax.learn.search import SearchInfo, objective, optimise, particles
+    from pegasus_jax.learn.schedule import SearchTable, search_table
+    from pegasus_jax.learn.search import (
+        Problem,
+        Sampler,
+        SearchInfo,
+        SearchState,
+        gradient_search,
+        sampler,
+        search,
+        searcher,
+    )
     from pegasus_jax.math import angles, gaussian
     from pegasus_jax.models import dropout as dropouts
     from pegasus_jax.models.bnn import bnn
@@ -68,8 +78,9 @@ _NAMES = {
     "imagine.scenarios": "blocks Blocks draw",
     "imagine.rollout": "rollout NoiseUse",
     "learn.fit": "fit FitInfo minibatches",
-    "learn.search": "objective optimise particles SearchInfo",
-    "learn.schedule": "Course",
+    "imagine.objective": "objective",
+    "learn.search": "gradient_search search searcher sampler Problem Sampler SearchInfo SearchState",
+    "learn.schedule": "search_table SearchTable",
     # models and policies
     "models.bnn": "bnn",
     "models.ensemble": "ensemble",
@@ -103,7 +114,6 @@ __all__ = [
     "Config",
     "Controller",
     "Cost",
-    "Course",
     "Dataset",
     "Dropout",
     "Dynamics",
@@ -116,11 +126,15 @@ __all__ = [
     "Period",
     "Policy",
     "Prediction",
+    "Problem",
     "Rollout",
     "RunError",
     "RunState",
+    "Sampler",
     "Scenarios",
     "SearchInfo",
+    "SearchState",
+    "SearchTable",
     "Searcher",
     "SettingError",
     "Successor",
@@ -143,6 +157,7 @@ __all__ = [
     "fit",
     "gaussian",
     "gp",
+    "gradient_search",
     "lagrangian",
     "linear",
     "matching",
@@ -150,13 +165,15 @@ __all__ = [
     "mlp",
     "objective",
     "of_pair",
-    "optimise",
-    "particles",
     "policy_of",
     "preset",
     "rbf",
     "rollout",
     "run",
+    "sampler",
+    "search",
+    "search_table",
+    "searcher",
     "ssgp",
     "tasks",
     "trial",

@@ -16,11 +16,12 @@ from pegasus_jax.experiment import experiment
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching, scenarios
 from pegasus_jax.imagine.costs import of_particles
+from pegasus_jax.imagine.objective import either, objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
 from pegasus_jax.learn.fit import falling, minibatches
 from pegasus_jax.learn.multistart import best_of
-from pegasus_jax.learn.schedule import Course, either, narrowing, pace, reheated
-from pegasus_jax.learn.search import objective, particles
+from pegasus_jax.learn.schedule import SearchTable, search_table
+from pegasus_jax.learn.search import Problem, sampler, searcher
 from pegasus_jax.math import angles, gaussian
 from pegasus_jax.models import dropout
 from pegasus_jax.models.bnn import bnn
@@ -102,9 +103,6 @@ def compose(
         fit_steps=config.fit.steps,
         search=searcher or configured,
         search_steps=config.search.steps,
-        search_reset=config.search.reset,
-        search_restart=config.search.restart,
-        search_goes_on=config.search.anneal > 1,
         imagine=imagine,
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
@@ -170,45 +168,50 @@ def search_of(
     limit = None if search.limit is None else search.limit / search.particles
     match = matching.match if search.match else matching.keep
     costs = costs_of(search, task)
-    # The last part of a search is for refining: no matching, each particle's own cost, at its own width.
-    refine = round((1 - search.refine) * search.steps) if search.refine else None
-    steps = search.anneal * search.steps
-    narrow = (steps if refine is None else refine) / 2 if search.widen > 1 else 0
-    width = narrowing(search.widen, narrow) if narrow else None
-    step = pace(steps, search.decay, refine)
-    if step is not None and search.reheat:
-        step = reheated(step, steps, search.steps, search.reheat, search.decay)
+    table = table_of(search)
+    # What no row asks for is not compiled.
+    refines, widens = table.refine.any(), (table.cost_width != 1).any()
 
-    def value(params: Params, belief: Params, given: Scenarios, iteration: Array) -> Array:
-        refining = None if refine is None else iteration >= refine
-        cost = costs(refining, width and width(iteration))
-        onwards = either(refining, matching.keep, match)
-        longest = limit * jnp.where(iteration < steps, 1, search.loosen) if limit and search.reheat else limit
-        return objective(params, belief, given, **pieces, aggregate=aggregate, limit=longest, match=onwards, cost=cost)
+    def value(params: Params, belief: Params, given: Scenarios, row: SearchTable) -> Array:
+        refining = row.refine if refines else None
+        return objective(
+            params,
+            belief,
+            given,
+            **pieces,
+            aggregate=aggregate,
+            limit=None if limit is None else limit * row.limit,
+            match=either(refining, matching.keep, match),  # what refines has no matching, and each particle's own cost
+            cost=costs(refining, row.cost_width if widens else None),
+        )
 
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
-    searcher = particles(
-        value,
-        optimizer,
-        blocks=blocks,
-        period=Period(**vars(search.period)),
-        course=Course(
-            stage=jnp.asarray,
-            pace=step,
-            settled=narrow if refine is None else refine,
-            turns=() if refine is None else (refine, search.steps),
-            anew=search.anew,
-        ),
-    )
+    draws = sampler(blocks, Period(**vars(search.period)))
+    found = searcher(Problem(value, draws, optimizer, table, search.reset))
     if search.starts > 1:
-        lasting = search.anneal > 1  # one course for all searches: who began late would be behind
+        lasting = search.anneal > 1  # one schedule for all searches: who began late would be behind
         window = 1 if search.refine else max(1, search.steps // 20)  # what refines may end with another than its last
         fresh = lambda key, given: inherited(policy.init(key), given)  # noqa: E731
-        searcher = best_of(searcher, fresh, starts=search.starts, window=window, lasting=lasting)
+        found = best_of(found, fresh, starts=search.starts, window=window, lasting=lasting)
     # A refined policy is good for particles, not for their Gaussian.
-    seen_last = match if refine is None else matching.keep
-    return searcher, partial(imagined, **pieces, match=seen_last, blocks=blocks, task=task)
+    seen_last = matching.keep if refines else match
+    return found, partial(imagined, **pieces, match=seen_last, blocks=blocks, task=task)
+
+
+def table_of(search: settings.Search) -> SearchTable:
+    """What the configured search does, visit by visit."""
+    init = "fresh" if search.anew else "better" if search.restart else "previous"
+    return search_table(
+        search.steps,
+        init="previous" if search.starts > 1 else init,  # of several, others are fresh
+        refine=round((1 - search.refine) * search.steps) if search.refine else None,
+        widen=search.widen,
+        decay=search.decay,
+        anneal=search.anneal,
+        reheat=search.reheat,
+        loosen=search.loosen,
+    )
 
 
 def analytic_search_of(
@@ -253,7 +256,7 @@ def analytic_search_of(
     begin, expected = (mean, jnp.diag(std**2)), expected_cost_of(task)
     blocks = blocks_of(search.particles, task, dynamics, policy)
     imagine = partial(imagined, **pieces, blocks=blocks, task=task, match=matching.keep, noise=noise)
-    return pilco.analytic(value, noise_std), imagine
+    return pilco.analytic(value, noise_std, restart=search.restart), imagine
 
 
 def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Array | None], Callable[[Array], Array]]:

@@ -61,9 +61,6 @@ def experiment(
     fit_steps: int,
     search: Searcher,
     search_steps: int,
-    search_reset: bool,
-    search_restart: bool,
-    search_goes_on: bool,
     imagine: Callable[[Key, Params, Params], tuple[Rollout, Array]],
     explore: Callable[[Key], Array],
     explore_trials: int,
@@ -168,21 +165,20 @@ def experiment(
         key = trial_key(state.key, state.trial, SEARCH)
         belief = dynamics.condition(state.model.params, state.data)
 
-        earlier = search_steps * jnp.maximum(state.trial - max(1, explore_trials), 0) if search_goes_on else 0
+        explored = max(1, explore_trials)
         # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
         # that knows nothing is the better start.
-        fresh = adapted(policy.init(trial_key(state.key, state.trial, RESTART)), state.data) if search_restart else None
-        untrained = (state.trial <= max(1, explore_trials)) & (first == 0)
+        fresh = adapted(policy.init(trial_key(state.key, state.trial, RESTART)), state.data)
+        untrained = (state.trial <= explored) & (first == 0)
         given = optax.tree.where(untrained, adapted(state.policy.params, state.data), state.policy.params)
         learner, info = search.run(
             key,
             state.policy._replace(params=given),
             belief,
             first=first,
-            earlier=earlier,
+            earlier=jnp.maximum(state.trial - explored, 0),
             steps=steps,
-            rival=fresh,
-            reset=search_reset,
+            fresh=fresh,
         )
         return state._replace(policy=learner), info
 

@@ -185,7 +185,8 @@ class Searcher(NamedTuple):
     """How a policy improves in imagination (Alg. 1 line 6)."""
 
     init: Callable[[Params], Any]  # parameters -> the optimiser's state
-    # (key, learner, belief, first=, earlier=, steps=, rival=, reset=) -> (learner, SearchInfo)
+    # (key, learner, belief, steps=, first=, earlier=, fresh=) -> (learner, SearchInfo): iterations first .. first +
+    # steps - 1 of the search after `earlier` others; `fresh` are parameters of a policy that knows nothing
     run: Callable[..., tuple[Learner, Any]]
 
 

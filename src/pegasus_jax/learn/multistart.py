@@ -12,14 +12,14 @@ FRESH = 2**31 - 1  # what a search's key is folded with for fresh policies; for 
 
 
 def best_of(
-    searcher: Searcher, fresh: Callable[[Key, Params], Params], *, starts: int, window: int, lasting: bool = False
+    searcher: Searcher, make: Callable[[Key, Params], Params], *, starts: int, window: int, lasting: bool = False
 ) -> Searcher:
     """The searcher that searches from `starts` policies under the same scenarios, all of them until the trial ends.
 
-    The first is the policy it is given, the others are `fresh` (key, given policy) at iteration 0 of each trial; or of
+    The first is the policy it is given, the others are `make` (key, given policy) at iteration 0 of each trial; or of
     the first search where they are `lasting`, and then each goes on from trial to trial, whichever is the best. All
-    begin a trial with a new optimiser, and none has a rival. The learner's parameters are always those of the member
-    with the lowest mean objective over the last `window` iterations, or as many as there were. Its optimiser is all
+    begin a trial with a new optimizer. The learner's parameters are always those of the member
+    with the lowest mean objective over the last `window` iterations, or as many as there were. Its optimizer is all
     members: a `Learner` [starts, ...].
     """
 
@@ -34,15 +34,14 @@ def best_of(
         *,
         first: Array | int,
         steps: int,
-        rival: Any = None,
-        reset: bool = True,
-        **more: Any,
+        earlier: Array | int = 0,
+        fresh: Params | None = None,
     ) -> tuple[Learner, Any]:
-        del rival, reset
+        del fresh  # the members have others
 
         def gathered() -> Params:
             keys = jax.random.split(jax.random.fold_in(key, FRESH), starts - 1)
-            others = jax.vmap(fresh, (0, None))(keys, learner.params)
+            others = jax.vmap(make, (0, None))(keys, learner.params)
             return jax.tree.map(lambda own, rest: jnp.concatenate([own[None], rest]), learner.params, others)
 
         def begun() -> Learner:
@@ -52,7 +51,7 @@ def best_of(
             return Learner(members, jax.vmap(searcher.init)(members))
 
         members = jax.lax.cond(jnp.asarray(first) == 0, begun, lambda: learner.optimizer)
-        search = lambda member: searcher.run(key, member, belief, first=first, steps=steps, **more)  # noqa: E731
+        search = lambda member: searcher.run(key, member, belief, first=first, steps=steps, earlier=earlier)  # noqa: E731
         members, info = jax.vmap(search)(members)
         values = jnp.mean(info.objective[:, -window:], 1)
         best = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values))

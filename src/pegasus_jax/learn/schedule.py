@@ -1,65 +1,106 @@
-"""What changes over the iterations of a search: the width of its cost, its step size, whether it refines."""
+"""What a policy search does, written down before it begins: a table in NumPy, one row a visit of the objective."""
 
-from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax.numpy as jnp
-import optax
+import numpy as np
 
-from pegasus_jax.types import Array
-
-Schedule = Callable[[Array | int], Array]  # of the iteration, from 0
-
-
-class Course(NamedTuple):
-    """How a search goes on. By default every iteration is like the first."""
-
-    stage: Schedule | None = None  # what the objective is told of the iteration
-    pace: Schedule | None = None  # a factor of the step
-    settled: float = 0  # the iteration from which the objective is what the search is for
-    turns: tuple[int, ...] = ()  # after so many it goes back to where it started or last turned, unless it found better
-    anew: bool = False  # it starts from its rival, whatever that costs
-
-    def at(self, i: Array | int) -> tuple[Array, ...]:
-        """What the objective of iteration i is told beyond policy parameters, belief and scenarios."""
-        return () if self.stage is None else (self.stage(i),)
+EVALUATE, STEP = range(2)  # what a row does with the candidate whose cost and gradient it computes
+CURRENT, FRESH, START, COARSE = range(4)  # which parameters it visits: see `SearchTable.candidate`
+ACTIONS, CANDIDATES = ("evaluate", "step"), ("current", "fresh", "start", "coarse")
+INITS = ("previous", "better", "fresh")
+REFINED = 0.03  # the step size at the end of a refinement, as a fraction of the search's
+Column = Any  # an array of NumPy, in a program one of JAX
 
 
-def narrowing(widest: float, over: float) -> Schedule:
-    """A factor of the cost's width that falls from `widest` at iteration 0 to 1 at iteration `over`, geometrically."""
-    return lambda i: widest ** jnp.maximum(0.0, 1 - i / over)
+class SearchTable(NamedTuple):
+    """R rows, those of a search of N iterations in the order of their visits, and their factors in T searches.
 
-
-def pace(steps: int, decay: float, refine: int | None = None) -> Schedule | None:
-    """A factor of the step size: in `steps` it falls from 1 to `decay`, as half a cosine; None if it is always 1.
-
-    From the iteration `refine` on it falls from 1 once more, to .03.
+    The factors of a search are those of its own number, from 0; the last ones serve every later search.
     """
-    if refine is None:
-        only = optax.cosine_decay_schedule(1.0, steps, decay)
-        return None if decay == 1 else lambda i: jnp.asarray(only(i))
-    fall = optax.cosine_decay_schedule(1.0, max(refine, 1), decay)
-    again = optax.cosine_decay_schedule(1.0, max(steps - refine, 1), 0.03)
-    return lambda i: jnp.where(i < refine, fall(i), again(i - refine))
+
+    iteration: Column  # [R] the iteration that the row belongs to, 0..N-1: N iterations can be cut anywhere
+    scenarios: Column  # [R] the iteration whose scenarios it is under: after the last step of a phase, the next one
+    action: Column  # [R] STEP goes on from the candidate, along its gradient; EVALUATE compares costs
+    # [R] CURRENT: what the search has now. To evaluate one of the others takes it in place of CURRENT, evaluated in the
+    # row before, if it costs no more: FRESH, a policy that knows nothing; START, what the search was given; COARSE,
+    # what the refinement started from. The last two are also taken where a cost is NaN; FRESH is not.
+    candidate: Column
+    refine: Column  # [R] whether the objective is the refining one
+    cost_width: Column  # [T, R] factor of the cost's width
+    step_size: Column  # [T, R] factor of the optimizer's update
+    limit: Column  # [T, R] factor of the limit on a particle's gradient
 
 
-def reheated(annealed: Schedule, over: int, steps: int, top: float, decay: float) -> Schedule:
-    """`annealed` before iteration `over`; then in each search of `steps` half a cosine, from `top` to `decay` of it."""
-    fall = optax.cosine_decay_schedule(top, steps, decay)
-    return lambda i: jnp.where(i < over, annealed(i), fall((i - over) % steps))
+def search_table(
+    steps: int,
+    *,
+    init: str = "previous",
+    refine: int | None = None,
+    widen: float = 1.0,
+    decay: float = 1.0,
+    anneal: int = 1,
+    reheat: float = 0.0,
+    loosen: float = 1.0,
+) -> SearchTable:
+    """The table of searches of `steps` iterations each.
 
-
-def either(condition: Array | None, yes: Callable[..., Array], no: Callable[..., Array]) -> Callable[..., Array]:
-    """The function that is `yes` where the condition holds and else `no`; without a condition, `no`.
-
-    Both are computed, because a branch at each time step costs a GPU more than they do. The one that is not asked for
-    gets zeros: what it would make of a particle that has diverged reaches no gradient.
+    init: what a search starts from: the `previous` policy, a `fresh` one, or the `better` of both.
+    refine: the iteration from which it refines the better of what it found and what it was given; None: never.
+    widen: the cost's width at the start; it falls to 1, geometrically, by half of the coarse iterations.
+    decay: the step size at the end of the coarse iterations, which falls from 1 as half a cosine.
+    anneal: searches over which width and step size fall once.
+    reheat, loosen: after those each search's step size falls from `reheat` to `decay` of it, under `loosen` times the
+    limit; with reheat=0 both stay as they are. Raises ValueError for another `init`.
     """
-    if condition is None:
-        return no
+    if init not in INITS:
+        raise ValueError(f"init={init!r}; choose from {', '.join(INITS)}")
+    rows = np.array(_visits(steps, init, refine), np.int32).reshape(-1, 4)
+    iteration, scenarios, action, candidate = rows.T
+    number = np.arange(anneal + 1 if anneal > 1 else 1)[:, None]
+    i = number * steps + scenarios  # [T, R] counted over all searches
+    coarse = anneal * steps if refine is None else refine
+    over = coarse / 2 if widen > 1 else 0
+    width = widen ** np.maximum(0, 1 - i / over) if over else np.ones(i.shape)
+    step_size = half_cosine(i / max(coarse, 1), 1, decay)
+    if refine is not None:
+        step_size = np.where(i < refine, step_size, half_cosine((i - refine) / max(steps - refine, 1), 1, REFINED))
+    limit = np.ones(i.shape)
+    if reheat:
+        annealed = number < anneal
+        step_size = np.where(annealed, step_size, half_cosine(scenarios / steps, reheat, decay))
+        limit = np.where(annealed, limit, loosen)
+    refines = np.zeros(len(rows), bool) if refine is None else scenarios >= refine
+    return SearchTable(iteration, scenarios, action, candidate, refines, width, step_size, limit)
 
-    def chosen(*arguments: Array) -> Array:
-        asked, other = ([jnp.where(c, a, 0) for a in arguments] for c in (condition, ~condition))
-        return jnp.where(condition, yes(*asked), no(*other))
 
-    return chosen
+def _visits(steps: int, init: str, refine: int | None) -> list[tuple[int, int, int, int]]:
+    """The rows (iteration, scenarios, action, candidate) of a search."""
+    rows = [(0, 0, EVALUATE, CURRENT), (0, 0, EVALUATE, FRESH)] if init == "better" else []
+    for i in range(steps):
+        rows += [(i, i, STEP, FRESH if init == "fresh" and i == 0 else CURRENT)]
+        if refine is not None and i + 1 in (refine, steps):
+            given = START if i + 1 == refine else COARSE
+            rows += [(i, i + 1, EVALUATE, CURRENT), (i, i + 1, EVALUATE, given)]
+    return rows
+
+
+def half_cosine(fraction: Any, top: float, decay: float) -> np.ndarray:
+    """A factor that falls from `top` to `decay` of it as the fraction goes from 0 to 1, and stays there."""
+    cosine = (1 + np.cos(np.pi * np.minimum(fraction, 1))) / 2
+    return top * ((1 - decay) * cosine + decay)
+
+
+def first_rows(table: SearchTable) -> np.ndarray:
+    """[N+1] the row with which each iteration begins, and the number of rows."""
+    return np.searchsorted(table.iteration, np.arange(table.iteration.max(initial=-1) + 2)).astype(np.int32)
+
+
+def text(table: SearchTable, search: int = 0) -> str:
+    """The table of one search, from 0, as lines of words and numbers."""
+    head = "iteration scenarios action   candidate refine  width   step  limit"
+    factors = [column[min(search, len(column) - 1)] for column in table[-3:]]
+    lines = [
+        f"{i:9d} {s:9d} {ACTIONS[a]:8s} {CANDIDATES[c]:9s} {'yes' if r else 'no':6s} {w:6.3f} {size:6.3f} {limit:6.3g}"
+        for i, s, a, c, r, w, size, limit in zip(*table[:-3], *factors, strict=True)
+    ]
+    return "\n".join([head, *lines])

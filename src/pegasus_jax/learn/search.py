@@ -1,222 +1,213 @@
 """Policy search: follow the gradient of the imagined cost under held scenarios (Alg. 3)."""
 
 from collections.abc import Callable
-from functools import partial, reduce
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 
-from pegasus_jax.imagine import costs
-from pegasus_jax.imagine.rollout import NoiseUse, rollout
-from pegasus_jax.imagine.scenarios import Blocks, draw, redraw
-from pegasus_jax.learn.fit import guarded, skipped
-from pegasus_jax.learn.schedule import Course
-from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Period, Policy, Scenarios, Searcher
+from pegasus_jax.imagine import scenarios as drawing
+from pegasus_jax.learn.schedule import FRESH, START, STEP, SearchTable, first_rows
+from pegasus_jax.types import Array, Key, Learner, Params, Period, Scenarios, Searcher
 
 
-class Remembering(NamedTuple):
-    """State of an optimiser that remembers the best parameters it has seen."""
+class Sampler(NamedTuple):
+    """Where the scenarios of a search come from."""
 
-    inner_state: optax.OptState
-    best_value: Array  # [] the lowest objective so far
-    best_params: Params  # that had it
+    draw: Callable[[Key, Array, Params], Scenarios]  # (key, iteration, posterior)
+    redraw: Callable[[Key, Array, Scenarios, Params], Scenarios]  # (key, iteration, those before it, posterior)
 
 
-def remembering(optimizer: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
-    """The optimiser, which also remembers the parameters with the lowest `value`; see `keeping_best`."""
-    optimizer = optax.with_extra_args_support(optimizer)
-
-    def init(params: Params) -> Remembering:
-        return Remembering(optimizer.init(params), jnp.full((), jnp.inf), params)
-
-    def update(updates: Params, state: Any, params: Params = None, *, value: Array, **extra: Any) -> tuple[Params, Any]:
-        updates, inner = optimizer.update(updates, state.inner_state, params, value=value, **extra)
-        better = value < state.best_value
-        kept = optax.tree.where(better, params, state.best_params)
-        return updates, Remembering(inner, jnp.where(better, value, state.best_value), kept)
-
-    return optax.GradientTransformationExtraArgs(init, update)  # type: ignore[arg-type]
+def sampler(blocks: drawing.Blocks, period: Period) -> Sampler:
+    """Scenarios drawn from `blocks`, each held for its `period` of iterations."""
+    return Sampler(*(partial(function, blocks=blocks, period=period) for function in (drawing.draw, drawing.redraw)))
 
 
 class SearchInfo(NamedTuple):
     """How a search went, iteration by iteration."""
 
-    objective: Array  # [steps]; of an iteration after which it turned, that of the policy it went on with
+    objective: Array  # [steps]; where an iteration ends with a comparison, that of the policy that goes on
     gradient_norm: Array  # [steps] before clipping
     skipped: Array  # [] updates skipped because a gradient was not finite
 
 
-def objective(
-    policy_params: Params,
-    belief: Params,
-    scenarios: Scenarios,
-    *,
-    dynamics: Dynamics,
-    policy: Policy,
-    match: Callable[[Array, Array], Array],
-    cost: Callable[[Array], Array],
-    aggregate: Callable[[Array], Array] = costs.mean,
-    noise: NoiseUse = NoiseUse(),
-    limit: Array | float | None = None,
-) -> Array:
-    """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
-    imagined = rollout(
-        policy_params,
-        belief,
-        scenarios,
-        dynamics=dynamics,
-        policy=policy,
-        match=match,
-        noise=noise,
-        limit=limit,
-    )
-    return aggregate(cost(imagined.x[1:]))
+class SearchState(NamedTuple):
+    """What a search knows beyond its parameters: with it, it goes on at any row of its table."""
+
+    optimizer: optax.OptState
+    start: Params  # what the search, or its refinement, started from
+    last: Array  # [] the objective at the row before
+    no_improvement: Array  # [] whether the last search found nothing better than what it was given, before it refined
 
 
-class Started(NamedTuple):
-    """State of an optimiser that remembers where it started, and whether that led anywhere."""
+class Problem(NamedTuple):
+    """What a search minimizes, and how."""
 
-    inner_state: optax.OptState
-    start: Params
-    stale: Array  # [] whether the search went back to where it had started when it first turned
-
-
-def started(optimizer: optax.GradientTransformation) -> optax.GradientTransformationExtraArgs:
-    """The optimiser, which also keeps the parameters that a search, or its part after a turn, started from."""
-    optimizer = optax.with_extra_args_support(optimizer)
-
-    def update(updates: Params, state: Any, params: Params = None, **extra: Any) -> tuple[Params, Any]:
-        updates, inner = optimizer.update(updates, state.inner_state, params, **extra)
-        return updates, state._replace(inner_state=inner)
-
-    def init(params: Params) -> Started:
-        return Started(optimizer.init(params), params, jnp.zeros((), bool))
-
-    return optax.GradientTransformationExtraArgs(init, update)  # type: ignore[arg-type]
+    objective: Callable[..., Array]  # (policy parameters, posterior, scenarios, row of the table) -> []
+    sampler: Sampler
+    optimizer: optax.GradientTransformation  # any of optax
+    table: SearchTable
+    reset: bool = True  # whether each search starts with a new optimizer state
 
 
-class Walk(NamedTuple):
-    """Where a search is. Where it weighs, an iteration is three visits: of the rival, of its own parameters, a step."""
-
-    learner: Learner
-    scenarios: Scenarios  # packed
-    iteration: Array  # [] int32
-    visit: Array  # [] RIVAL, OWN or STEP
-    held: Array  # [] what the rival costs
-    values: Array  # [steps]
-    norms: Array  # [steps]
-
-
-RIVAL, OWN, STEP = range(3)
-
-
-def optimise(
+def gradient_search(
     key: Key,
     learner: Learner,
-    belief: Params,
+    posterior: Params,
     *,
-    draw: Callable[[Key, Array, Params], Scenarios],
-    redraw: Callable[[Key, Array, Scenarios, Params], Scenarios],
-    objective: Callable[..., Array],
+    objective: Callable[[Params, Params, Scenarios], Array],
+    sampler: Sampler,
     optimizer: optax.GradientTransformation,
+    steps: int,
+) -> tuple[Learner, SearchInfo]:
+    """Alg. 3 as printed: `steps` updates along the gradient of `objective` under the scenarios of each iteration.
+
+    The learner is policy parameters and `optimizer.init` of them. A gradient with a non-finite entry changes nothing.
+    """
+
+    def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], SearchInfo]:
+        learner, scenarios = carry
+        value, gradient = jax.value_and_grad(objective)(learner.params, posterior, scenarios)
+        updates, state = update_if(is_finite(gradient), optimizer, gradient, learner, value)
+        learner = Learner(optax.apply_updates(learner.params, updates), state)
+        info = SearchInfo(value, optax.tree.norm(gradient), ~is_finite(gradient))
+        return (learner, sampler.redraw(key, i + 1, scenarios, posterior)), info
+
+    begun = learner, sampler.draw(key, jnp.int32(0), posterior)
+    (learner, _), info = jax.lax.scan(step, begun, jnp.arange(steps))
+    return learner, info._replace(skipped=jnp.sum(info.skipped))
+
+
+def is_finite(gradient: Params) -> Array:
+    """[] whether every entry is."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)]))
+
+
+def update_if(
+    condition: Array, optimizer: optax.GradientTransformation, gradient: Params, learner: Learner, value: Array
+) -> tuple[Params, optax.OptState]:
+    """The optimizer's updates and its next state; where the condition does not hold zeros, and its state as it is."""
+    update = partial(optax.with_extra_args_support(optimizer).update, value=value)
+    zeros = jax.tree.map(jnp.zeros_like, gradient)
+    return jax.lax.cond(
+        condition,
+        lambda: update(gradient, learner.optimizer, learner.params),
+        lambda: (zeros, learner.optimizer),
+    )
+
+
+def searcher(problem: Problem) -> Searcher:
+    """The searcher of a problem: its `run` is `search`, its learner's optimizer a `SearchState`."""
+
+    def init(params: Params) -> SearchState:
+        return SearchState(problem.optimizer.init(params), params, jnp.full((), jnp.nan), jnp.zeros((), bool))
+
+    return Searcher(init, partial(search, problem=problem))
+
+
+def search(
+    key: Key,
+    learner: Learner,
+    posterior: Params,
+    *,
+    problem: Problem,
     steps: int,
     first: Array | int = 0,
     earlier: Array | int = 0,
-    course: Course = Course(),
-    rival: Params | None = None,
-    reset: bool = False,
+    fresh: Params | None = None,
 ) -> tuple[Learner, SearchInfo]:
-    """Iterations first .. first + steps - 1 of a search (Alg. 3 lines 4 to 19).
+    """The rows of iterations first .. first + steps - 1 of the problem's table, in the search after `earlier` others.
 
-    One call of n steps and two calls of n/2, the second with first=n/2, do the same. With a stage in the `course`, the
-    objective takes one more argument, the stage of the iteration; a course with turns needs a `started` optimiser.
-    The course counts from `earlier`: the iterations of the searches before this one, where it goes on with theirs.
-
-    Iteration 0 goes on from the `rival`, if there is one, where that costs no more than the learner's parameters, where
-    the search before was stale, or where the course says so; with `reset`, with a new optimiser. At a turn, the end
-    among them, a search goes on from what it started from, or had at the turn before, unless what it has now costs
-    less. NaN decides for the older ones. What is weighed visits the loop's own objective: another one would take as
-    long again to compile.
+    One call of n steps and two calls of n/2, the second with first=n/2, do the same. `fresh` is the policy that a table
+    may have as a candidate. All rows visit one objective: a second one would take as long again to compile. Raises
+    ValueError for more iterations than the table has, and where its fresh policy is missing.
     """
-    optimizer = optax.with_extra_args_support(optimizer)
-    weighs = bool(course.turns) or rival is not None
-    stale = optax.tree.get(learner.optimizer, "stale", False)
-    if reset:
-        anew = lambda old: old._replace(optimizer=optimizer.init(old.params))  # noqa: E731
-        learner = jax.lax.cond(first == 0, anew, lambda old: old, learner)
-    if course.turns:
-        start = optax.tree.where(first == 0, learner.params, optax.tree.get(learner.optimizer, "start"))
-        learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, start=start))
+    table, draw, redraw = problem.table, problem.sampler.draw, problem.sampler.redraw
+    check(table, steps, fresh)
+    rows, begin = of_search(table, earlier), first_rows(table)
+    following = jnp.append(rows.scenarios[1:], 0)
 
-    def turns(i: Array) -> Array:
-        # One by one: jaxlib 0.11 crashes on an array of no turns where seeds are shared out over devices.
-        return reduce(jnp.logical_or, [i == turn for turn in course.turns], jnp.zeros((), bool))
-
-    def other(learner: Learner, i: Array) -> Params:
-        """What the learner's parameters are weighed against."""
-        if not course.turns:
-            return rival
-        start = optax.tree.get(learner.optimizer, "start")
-        return start if rival is None else optax.tree.where(i == 0, rival, start)
-
-    def visit(_: Array, walk: Walk) -> Walk:
-        learner, i = walk.learner, walk.iteration
-        scenarios = unpacked(walk.scenarios, like=drawn)
-        params = optax.tree.where(walk.visit == RIVAL, other(learner, i), learner.params) if weighs else learner.params
-        value, gradient = jax.value_and_grad(objective)(params, belief, scenarios, *course.at(earlier + i))
-        steps_now, after = walk.visit == STEP, stepped(learner, i, value, gradient)
-        if weighs:
-            after = optax.tree.where(
-                steps_now, after, optax.tree.where(walk.visit == OWN, chosen(walk, value), learner)
-            )
-        # Of an iteration after which it turned, the cost of what it goes on from.
-        settles = (walk.visit == OWN) & (i > 0)
-        row = jnp.where(steps_now, i - first, jnp.where(settles, i - first - 1, steps))
-        cost = jnp.where(settles & ~(value < walk.held), walk.held, value)
-        reached = i + steps_now
-        return Walk(
-            after,
-            packed(redraw(key, reached, scenarios, belief)),
-            reached,
-            jnp.where(steps_now, jnp.where(turns(reached), RIVAL, STEP), walk.visit + 1),
-            value,
-            walk.values.at[row].set(cost, mode="drop"),
-            walk.norms.at[jnp.where(steps_now, row, steps)].set(optax.tree.norm(gradient), mode="drop"),
+    def visit(r: Array, loop: Loop) -> Loop:
+        (params, state), info = loop.learner, loop.info
+        row: SearchTable = jax.tree.map(lambda column: column[r], rows)
+        scenarios = unpacked(loop.scenarios, drawn)
+        others = params if fresh is None else fresh, state.start, state.start
+        visited = jax.tree.map(lambda *those: jax.lax.select_n(row.candidate, *those), params, *others)
+        value, gradient = jax.value_and_grad(problem.objective)(visited, posterior, scenarios, row)
+        learner, cost, skipped = after(row, loop.learner, visited, value, gradient, problem.optimizer)
+        i = row.iteration - first
+        norm_of = jnp.where(row.action == STEP, i, steps)
+        info = SearchInfo(
+            info.objective.at[i].set(cost),
+            info.gradient_norm.at[norm_of].set(optax.tree.norm(gradient), mode="drop"),
+            info.skipped + skipped,
         )
+        return Loop(learner, packed(redraw(key, following[r], scenarios, posterior)), info)
 
-    def stepped(learner: Learner, i: Array, value: Array, gradient: Params) -> Learner:
-        # A wider cost is a lower one: its value says nothing about which parameters are best.
-        known = jnp.where(i < course.settled, jnp.inf, value) if course.settled else value
-        updates, state = optimizer.update(gradient, learner.optimizer, learner.params, value=known)
-        if course.pace is not None:
-            updates = optax.tree.scale(course.pace(earlier + i), updates)
-        return Learner(optax.apply_updates(learner.params, updates), state)
-
-    def chosen(walk: Walk, value: Array) -> Learner:
-        """The learner at its own parameters, which cost `value`, or at the rival's."""
-        learner, i = walk.learner, walk.iteration
-        begins = i == 0
-        yields = jnp.where(begins, (walk.held <= value) | stale | course.anew, ~(value < walk.held))
-        kept = Learner(optax.tree.where(yields, other(learner, i), learner.params), learner.optimizer)
-        if not course.turns:
-            return kept
-        was = optax.tree.get(learner.optimizer, "stale")
-        now = dict(
-            start=optax.tree.where(begins, optax.tree.get(learner.optimizer, "start"), kept.params),
-            stale=jnp.where(~begins & (i == course.turns[0]), yields, was),
-        )
-        return kept._replace(optimizer=optax.tree.set(learner.optimizer, **now))
-
-    begun, before = jnp.asarray(first, jnp.int32), skipped(learner.optimizer)
-    drawn = draw(key, begun, belief)
-    begins = rival is not None and first == 0
-    weighings = begins + sum((first < turn) & (turn <= first + steps) for turn in {*course.turns})
+    drawn = draw(key, jnp.asarray(first, jnp.int32), posterior)
     none = jnp.full(steps, jnp.nan)
-    walk = Walk(learner, packed(drawn), begun, jnp.where(begins, RIVAL, STEP), none[0], none, none)
-    learner, *_, values, norms = jax.lax.fori_loop(0, steps + 2 * weighings, visit, walk)
-    return learner, SearchInfo(values, norms, skipped(learner.optimizer) - before)
+    loop = Loop(begun(learner, first, problem), packed(drawn), SearchInfo(none, none, jnp.int32(0)))
+    row, end = (jnp.asarray(begin)[i] for i in (first, first + steps))
+    count = steps if len(table.action) == len(begin) - 1 else end - row  # a known number is quicker on a GPU
+    loop = jax.lax.fori_loop(0, count, lambda k, loop: visit(row + k, loop), loop)
+    return loop.learner, loop.info
+
+
+class Loop(NamedTuple):
+    """What one row of a search hands to the next."""
+
+    learner: Learner  # its optimizer is a SearchState
+    scenarios: Scenarios  # packed
+    info: SearchInfo
+
+
+def check(table: SearchTable, steps: int, fresh: Params | None) -> None:
+    """Raise ValueError where a table lacks what it is asked for, or what it needs."""
+    if steps > (most := len(first_rows(table)) - 1):
+        raise ValueError(f"steps={steps}: the table of this search has {most}")
+    if fresh is None and FRESH in table.candidate:
+        raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
+
+
+def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
+    """The table [R] of the search after `earlier` others. Its numbers are data: no search compiles another program."""
+    searches = len(table.limit)
+    # Where all are alike there is no choice to make: of searches vmapped over `earlier` each would have its own.
+    number = jnp.minimum(earlier, searches - 1) if searches > 1 else 0
+    return SearchTable(*map(jnp.asarray, table[:-3]), *(jnp.asarray(column)[number] for column in table[-3:]))
+
+
+def begun(learner: Learner, first: Array | int, problem: Problem) -> Learner:
+    """The learner as the search has it: new at its iteration 0, later as it is."""
+    begins, state = jnp.asarray(first) == 0, learner.optimizer
+    fresh = problem.optimizer.init(learner.params) if problem.reset else state.optimizer
+    optimizer, start = optax.tree.where(begins, (fresh, learner.params), (state.optimizer, state.start))
+    return Learner(learner.params, state._replace(optimizer=optimizer, start=start))
+
+
+def after(
+    row: SearchTable,
+    learner: Learner,
+    visited: Params,
+    value: Array,
+    gradient: Params,
+    optimizer: optax.GradientTransformation,
+) -> tuple[Learner, Array, Array]:
+    """What a row makes of the cost and gradient of what it visited -> (learner, cost of its parameters, skipped)."""
+    (params, state), finite = learner, is_finite(gradient)
+    # NaN decides for the older policy, a tie for the other one: where the cost is flat, nothing else leads away.
+    older = ~(state.last < value)
+    taken = jnp.stack([True, (value <= state.last) | state.no_improvement, older, older])[row.candidate]
+    steps_now = row.action == STEP
+    taken |= steps_now
+    params = optax.tree.where(taken, visited, params)
+    updates, moved = update_if(steps_now & finite, optimizer, gradient, Learner(params, state.optimizer), value)
+    start = optax.tree.where(row.candidate >= START, params, state.start)
+    state = SearchState(moved, start, value, jnp.where(row.candidate == START, taken, state.no_improvement))
+    params = optax.apply_updates(params, optax.tree.scale(row.step_size, updates))
+    return Learner(params, state), jnp.where(taken, value, learner.optimizer.last), steps_now & ~finite
 
 
 def packed(scenarios: Params) -> Params:
@@ -231,44 +222,3 @@ def packed(scenarios: Params) -> Params:
 def unpacked(packed: Params, like: Params) -> Params:
     """The scenarios that were packed, in the shapes of `like`."""
     return jax.tree.map(lambda leaf, shaped: leaf.reshape(shaped.shape), packed, like)
-
-
-def particles(
-    objective: Callable[..., Array],
-    optimizer: optax.GradientTransformation,
-    *,
-    blocks: Blocks,
-    period: Period,
-    course: Course = Course(),
-) -> Searcher:
-    """The searcher that follows the gradient of `objective` under scenarios drawn from `blocks`, held for `period`."""
-    optimizer = guarded(started(optimizer) if course.turns else optimizer)
-    pieces: dict[str, Any] = dict(
-        draw=partial(draw, blocks=blocks, period=period),
-        redraw=partial(redraw, blocks=blocks, period=period),
-        objective=objective,
-        optimizer=optimizer,
-        course=course,
-    )
-    return Searcher(init=optimizer.init, run=partial(optimise, **pieces))
-
-
-def keeping_best(searcher: Searcher, last: int) -> Searcher:
-    """The searcher that ends a trial's search of `last` iterations with the best parameters it met, not the last.
-
-    Its optimiser must be `remembering`. Values are compared as they are, like the authors' option to return the best:
-    with redrawn scenarios each is noisy, so the lowest is partly luck, and not as good as it looks.
-    """
-
-    def run(
-        key: Key, learner: Learner, belief: Params, *, first: Array | int, steps: int, **more: Any
-    ) -> tuple[Learner, Any]:
-        known = optax.tree.get(learner.optimizer, "best_value")
-        known = jnp.where(jnp.asarray(first) == 0, jnp.inf, known)  # what an older model thought does not count
-        learner = learner._replace(optimizer=optax.tree.set(learner.optimizer, best_value=known))
-        learner, info = searcher.run(key, learner, belief, first=first, steps=steps, **more)
-        best = optax.tree.get(learner.optimizer, "best_params")
-        kept = optax.tree.where(first + steps >= last, best, learner.params)
-        return learner._replace(params=kept), info
-
-    return searcher._replace(run=run)

@@ -105,11 +105,14 @@ def objective(
 
 
 def analytic(
-    objective: Callable[[Params, Params, Array], Array], noise_std: Callable[[Key, Params], Array]
+    objective: Callable[[Params, Params, Array], Array],
+    noise_std: Callable[[Key, Params], Array],
+    restart: bool = False,
 ) -> Searcher:
     """The searcher that minimises `objective(policy parameters, belief, std)` by L-BFGS, as far as that goes.
 
-    `noise_std(key, belief)` is the model's noise std [D]. A search knows nothing of the ones before: their values and
+    `noise_std(key, belief)` is the model's noise std [D]. With `restart` a search starts from its fresh policy where
+    that costs no more than the one before. A search knows nothing of the ones before: their values and
     their curvature were another model's.
     """
 
@@ -120,7 +123,7 @@ def analytic(
         *,
         first: Array | int,
         steps: int,
-        rival: Params | None = None,
+        fresh: Params | None = None,
         **_: Any,
     ) -> tuple[Learner, SearchInfo]:
         std = noise_std(key, belief)
@@ -129,13 +132,13 @@ def analytic(
             return objective(params, belief, std)
 
         def cheaper(params: Params) -> Params:
-            """These, or the rival's where that costs no more."""
-            both = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, rival)
+            """These, or the fresh ones where those cost no more."""
+            both = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, fresh)
             own, other = jax.vmap(value)(both)
-            return optax.tree.where(other <= own, rival, params)
+            return optax.tree.where(other <= own, fresh, params)
 
         new = jnp.asarray(first) == 0
-        if rival is not None:
+        if restart:
             learner = learner._replace(params=jax.lax.cond(new, cheaper, lambda params: params, learner.params))
 
         def idle(d: lbfgs.Descent) -> tuple[lbfgs.Descent, tuple[Array, Params]]:
