@@ -287,6 +287,15 @@ def test_a_fresh_policy_that_a_table_needs_and_iterations_that_it_lacks_are_erro
         found.run(jax.random.key(0), learner, 1.0, steps=3, fresh=jnp.zeros(3))
 
 
+def test_one_program_serves_the_first_search_and_all_others():
+    """The state has the types at its beginning that it has after a search: else each would compile anew."""
+    found, learner = on_table(search_table(2, refine=1), optax.adam(0.1), value=rowless)
+    run = jax.jit(partial(found.run, steps=2))
+    for _ in range(2):
+        learner, _ = run(jax.random.key(7), learner, 1.0, first=0)
+    assert run._cache_size() == 1
+
+
 def test_a_new_search_forgets_the_moments_or_goes_on_with_them():
     for reset in (True, False):
         found, learner = on_table(search_table(3), optax.adam(0.1), value=rowless, reset=reset)

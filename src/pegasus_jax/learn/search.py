@@ -102,7 +102,7 @@ def searcher(problem: Problem) -> Searcher:
     """The searcher of a problem: its `run` is `search`, its learner's optimizer a `SearchState`."""
 
     def init(params: Params) -> SearchState:
-        return SearchState(problem.optimizer.init(params), params, jnp.full((), jnp.nan), jnp.zeros((), bool))
+        return SearchState(problem.optimizer.init(params), params, jnp.asarray(jnp.nan, float), jnp.zeros((), bool))
 
     return Searcher(init, partial(search, problem=problem))
 
