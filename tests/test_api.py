@@ -180,8 +180,8 @@ def test_a_controller_of_a_run(tmp_path: Any) -> None:
 def _() -> Any:
     shape: dict[str, Any] = dict(states=D, controls=U, angles=())
     head = lambda raw: 0.1 * jax.nn.sigmoid(raw)  # noqa: E731
-    network: dict[str, Any] = dict(hidden=(4,), head=head, dropout=pg.dropouts.log_normal())
-    of_network = pg.bnn(**shape, **network, input_dropout=None, heteroscedastic=True, full_whitening=True)
+    network: dict[str, Any] = dict(hidden=(4,), dropout=pg.dropouts.log_normal())
+    of_network = pg.bnn(**shape, **network, head=head, heteroscedastic=True)
     mechanism = pg.lagrangian(**shape, **network, rates=(1,), dt=0.3, substeps=1, activation="tanh")
     models = (pg.ensemble(of_network, 2), mechanism, pg.gp(**shape, features=4), pg.ssgp(**shape, points=3), DYNAMICS)
     return [predicted(model) for model in models]
@@ -236,13 +236,37 @@ def _() -> Any:
     return by_hand, fitter.run(key(), pg.Learner(params, fitter.init(params)), experience(), 3)
 
 
-@example("optimise", "particles")
+@example("gradient_search", "sampler")
 def _() -> Any:
     params, belief, _ = imagined()
-    searcher = pg.particles(J, optax.adam(1e-3), blocks=blocks(), period=pg.Period(), course=pg.Course())
-    learner, info = searcher.run(key(), pg.Learner(params, searcher.init(params)), belief, steps=2)
+    optimizer, draws = optax.adam(1e-3), pg.sampler(blocks(), pg.Period())
+    learner = pg.Learner(params, optimizer.init(params))
+    how: dict[str, Any] = dict(objective=J, sampler=draws, optimizer=optimizer, steps=2)
+    learner, info = pg.gradient_search(key(), learner, belief, **how)
     assert info.objective.shape == (2,)
     return learner.params, info
+
+
+@example("search", "searcher", "search_table")
+def _() -> Any:
+    params, belief, _ = imagined()
+    table = pg.search_table(2, init="better")
+    assert isinstance(table, pg.SearchTable)
+    of_row = lambda params, belief, scenarios, row: J(params, belief, scenarios)  # noqa: E731
+    problem = pg.Problem(of_row, pg.sampler(blocks(), pg.Period()), optax.adam(1e-3), table)
+    found = pg.searcher(problem)
+    learner = pg.Learner(params, found.init(params))
+    assert isinstance(learner.optimizer, pg.SearchState)
+    fresh = POLICY.init(jax.random.key(1))
+    by_hand = pg.search(key(), learner, belief, problem=problem, steps=2, fresh=fresh)
+    return by_hand[0].params, found.run(key(), learner, belief, steps=2, fresh=fresh)[1]
+
+
+@example("preset")
+def _() -> Any:
+    config = pg.preset("cartpole")
+    assert isinstance(config, pg.Config)
+    assert config.task == "cartpole"
 
 
 @example(*(f"costs.{name}" for name in pg.costs.__all__))
@@ -485,7 +509,7 @@ def test_a_name_imports_what_it_needs_and_no_more(code: str, absent: set[str], p
 
 
 def test_a_refused_command_waits_for_no_array_library() -> None:
-    refused = "from pegasus_jax.cli import train\ntry: train.train(['serach.steps=5'])\nexcept ValueError: pass"
+    refused = "from pegasus_jax.cli.main import train\ntry: train.train(['serach.steps=5'])\nexcept ValueError: pass"
     found = loaded(refused)
     assert "pegasus_jax" in found
     assert not found & (APPLICATIONS | {"jax", "numpy", "flax", "optax"})

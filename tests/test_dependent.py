@@ -41,7 +41,7 @@ TINY = "search.steps=20 search.particles=30 model.hidden=[20] policy.hidden=[20]
 def test_every_update_is_finite(tmp_path: Path) -> None:
     """An angle, its tip's height, the angle in degrees, a constant and 1e4: each update of fit and search counts."""
     (tmp_path / "robot.py").write_text(ROBOT)
-    program = [sys.executable, "-P", "-c", "from pegasus_jax.cli import train; train()"]
+    program = [sys.executable, "-P", "-c", "from pegasus_jax.cli.main import train; train()"]
     done = subprocess.run(
         [*program, *WORDS.split(), *TINY.split()], cwd=tmp_path, capture_output=True, text=True, check=False
     )

@@ -34,7 +34,7 @@ def balanced(x):  # InvertedDoublePendulum-v5: cart, sin x2, cos x2, rates, forc
 
 def train(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     (cwd / "costs.py").write_text(COSTS)
-    program = [sys.executable, "-P", "-c", "from pegasus_jax.cli import train; train()", "task=gym"]
+    program = [sys.executable, "-P", "-c", "from pegasus_jax.cli.main import train; train()", "task=gym"]
     return subprocess.run([*program, *map(str, words)], cwd=cwd, capture_output=True, text=True, check=False)
 
 

@@ -87,7 +87,7 @@ def test_is_drawn_without_a_camera_of_its_own(pendulum: mjcf_plant.Mechanism) ->
 
 def command(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     (cwd / "costs.py").write_text(COSTS)
-    program = [sys.executable, "-P", "-c", "from pegasus_jax.cli import train; train()"]
+    program = [sys.executable, "-P", "-c", "from pegasus_jax.cli.main import train; train()"]
     return subprocess.run([*program, *map(str, words)], cwd=cwd, capture_output=True, text=True, check=False)
 
 

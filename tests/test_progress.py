@@ -181,7 +181,7 @@ def test_nothing_slow_is_imported_before_the_first_line() -> None:
 
 def test_words_of_the_environment_come_after_those_that_are_typed(tmp_path: Path) -> None:
     def helped(words: str) -> subprocess.CompletedProcess[str]:
-        program = [sys.executable, "-c", "from pegasus_jax.cli import train; train()"]
+        program = [sys.executable, "-c", "from pegasus_jax.cli.main import train; train()"]
         return subprocess.run(
             [*program, "task=cartpole", "trials=9", "--help"],
             capture_output=True,
@@ -200,7 +200,7 @@ def test_words_of_the_environment_come_after_those_that_are_typed(tmp_path: Path
 
 
 def test_the_first_line_comes_first_and_a_stop_before_the_run_begins_says_so(tmp_path: Path) -> None:
-    program = [sys.executable, "-c", "from pegasus_jax.cli import train; train()", "task=cartpole", "out=demo"]
+    program = [sys.executable, "-c", "from pegasus_jax.cli.main import train; train()", "task=cartpole", "out=demo"]
     process = subprocess.Popen(program, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     assert process.stdout is not None
     line = process.stdout.readline()

@@ -91,7 +91,7 @@ def test_an_unknown_task_is_named() -> None:
 )
 def test_a_tiny_trial_through_the_command_line(words: list[str], tmp_path: Path) -> None:
     run = tmp_path / "run"
-    program = [sys.executable, "-c", "from pegasus_jax.cli import train; train()"]
+    program = [sys.executable, "-c", "from pegasus_jax.cli.main import train; train()"]
     done = subprocess.run(
         [*program, *words, *TINY, f"out={run}"], cwd=tmp_path, capture_output=True, text=True, check=False
     )

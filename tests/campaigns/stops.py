@@ -113,7 +113,7 @@ def started(case: Case, folder: Path, fails: int) -> subprocess.Popen[str]:
         sys.executable,
         "-P",
         "-c",
-        "import sys; sys.path.insert(0, ''); from pegasus_jax.cli import train; train()",
+        "import sys; sys.path.insert(0, ''); from pegasus_jax.cli.main import train; train()",
     ]
     pipes: dict[str, Any] = dict(stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     pipes["preexec_fn"] = unignored

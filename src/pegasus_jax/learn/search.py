@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,7 @@ class SearchInfo(NamedTuple):
 class SearchState(NamedTuple):
     """What a search knows beyond its parameters: with it, it goes on at any row of its table."""
 
-    optimizer: optax.OptState
+    optimizer: Any  # the state of the problem's optimizer
     start: Params  # what the search, or its refinement, started from
     last: Array  # [] the objective at the row before
     no_improvement: Array  # [] whether the last search found nothing better than what it was given, before it refined
