@@ -23,7 +23,7 @@ STARTED = "PEGASUS_STARTED"  # when the command was given [s since 1970]
 def watched() -> None:
     """`pegasus-train` in this process, whose parts are timed; ends it after the first part of a search."""
     began, words = float(os.environ[STARTED]), sys.argv[1:]
-    from pegasus_jax.cli.main import main as cli
+    from pegasus_jax.cli import main as cli
     from pegasus_jax.runs import programs
 
     run, spent = programs.Program.__call__, {}

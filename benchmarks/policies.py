@@ -15,10 +15,10 @@ from typing import Any
 
 from benchmarks.study import RESULTS
 from pegasus_jax.runs import checkpoint, config_io, store
+from pegasus_jax.runs.evaluation import evaluate_run
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import share_processors
 from pegasus_jax.runs.restore import best
-from pegasus_jax.runs.train import evaluate_run
 
 
 def policies(run: Path, episodes: int) -> dict[str, Any]:

@@ -509,7 +509,7 @@ def test_a_name_imports_what_it_needs_and_no_more(code: str, absent: set[str], p
 
 
 def test_a_refused_command_waits_for_no_array_library() -> None:
-    refused = "from pegasus_jax.cli.main import train\ntry: train.train(['serach.steps=5'])\nexcept ValueError: pass"
+    refused = "from pegasus_jax.cli import train\ntry: train.train(['serach.steps=5'])\nexcept ValueError: pass"
     found = loaded(refused)
     assert "pegasus_jax" in found
     assert not found & (APPLICATIONS | {"jax", "numpy", "flax", "optax"})

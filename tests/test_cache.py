@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pegasus_jax.cli.main import main
+from pegasus_jax.cli import main
 from pegasus_jax.runs import cache
 from test_train import call
 

@@ -71,7 +71,7 @@ TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5"
 
 def call(name: str, *words: str, cwd: Path) -> tuple[int, str, list[str]]:
     (cwd / "robot.py").write_text(ROBOT)
-    program = [sys.executable, "-P", "-c", f"from pegasus_jax.cli import {name}; {name}()"]
+    program = [sys.executable, "-P", "-c", f"from pegasus_jax.cli.main import {name}; {name}()"]
     done = subprocess.run([*program, *WORDS, *words], cwd=cwd, capture_output=True, text=True, check=False)
     log = cwd / "asked.log"
     return done.returncode, done.stdout + done.stderr, log.read_text().split() if log.exists() else []

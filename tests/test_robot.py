@@ -61,7 +61,7 @@ PROGRAM = [sys.executable, "-P", "-c"]
 
 def started(name: str, *words: object, cwd: Path, **environment: int) -> subprocess.Popen[str]:
     (cwd / "robot.py").write_text(ROBOT + WATCHED)
-    program = [*PROGRAM, f"from pegasus_jax.cli import {name}; {name}()", *map(str, words)]
+    program = [*PROGRAM, f"from pegasus_jax.cli.main import {name}; {name}()", *map(str, words)]
     told = {**os.environ, **{key: str(value) for key, value in environment.items()}}
     return subprocess.Popen(program, cwd=cwd, env=told, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 

@@ -23,7 +23,7 @@ TINY += ["fit.steps=20", "search.steps=20", "search.particles=10"]
 
 def program(name: str) -> list[str]:
     """The installed console script, run by this interpreter."""
-    return [sys.executable, "-c", f"from pegasus_jax.cli import {name}; {name}()"]
+    return [sys.executable, "-c", f"from pegasus_jax.cli.main import {name}; {name}()"]
 
 
 def call(name: str, *words: object, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:

@@ -15,7 +15,7 @@ def evaluate(words: Sequence[str]) -> None:
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     if rest["json"] not in ("true", "false"):
         raise SettingError(f"json={rest['json']} is neither true nor false")
-    from pegasus_jax.runs.train import evaluate_run
+    from pegasus_jax.runs.evaluation import evaluate_run
 
     result = evaluate_run(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None)
     if rest["json"] == "true":

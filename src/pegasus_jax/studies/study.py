@@ -1,39 +1,34 @@
 """Learning studies: every seed of a configuration in one vmapped program, every curve kept raw."""
 
 import json
-import sys
 import time
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import sharding
-from pegasus_jax.builder import build, set_precision
 from pegasus_jax.checks import SIZES, SettingError
 from pegasus_jax.config import GYM, Config
-from pegasus_jax.episode import succeeded
-from pegasus_jax.experiment import TrialInfo, trial
-from pegasus_jax.runs import config_io
+from pegasus_jax.runs import config_io, writers
 from pegasus_jax.runs.files import write_whole
-from pegasus_jax.runs.programs import LASTING, compiler_options, described
-from pegasus_jax.runs.train import saturated
-from pegasus_jax.types import Array, Experiment, RunState, Task
+from pegasus_jax.runs.job import first_states, opened
+from pegasus_jax.runs.train import learn
+from pegasus_jax.runs.writers import Row, Writer
+from pegasus_jax.types import RunState, Task
 
 SOLVED = 0.9  # of a trial's evaluation episodes succeed
 
-# What is a seed's own; the trial is one number for all, so that the random trials are without a search in fact.
-SEEDS = RunState(0, 0, 0, 0, None, 0)  # type: ignore[arg-type]
+# The curves [S, T] of a study that are rounded, by the names that they have in a row of trials.jsonl too.
+ROUNDED = ("mean_cost", "episode_cost", "objective_last", "objective_fresh", "saturated", "calibration")
 
 
 def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[str, Any]:
     """Curves [S, T] of a configuration over seeds; written to `path` after every trial, so that nothing is lost.
 
-    `curves` says what is in them. Raises SettingError for a plant that cannot be vmapped.
+    The seeds learn what `pegasus-train` would learn with them (runs/train.py); `curves` says what is kept. Raises
+    SettingError for a plant that cannot be vmapped.
     """
     if config.task == GYM:
         raise SettingError(
@@ -41,83 +36,56 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
         )
     if not config.evaluation:
         raise SettingError("evaluation=0 leaves a study nothing to compare; the nearest is 1")
-    set_precision(config)
-    experiment = build(config)
-    over = sharding.evenly(len(seeds))
+    result: dict[str, Any] = {}
 
-    def each(function: Callable[..., Any], given: Any, returned: Any = 0) -> Callable[..., Any]:
-        vmapped = jax.vmap(function, given, returned)
-        return vmapped if over is None else sharding.each_its_own(vmapped, over, given, returned)
-
-    # What lies where: a seed's own on the devices for seeds, the number of the trial on all.
-    own, all_the_same = (None, None) if over is None else (sharding.over_seeds(over), sharding.shared(over))
-    laid_out = RunState(own, own, own, own, all_the_same, own)  # type: ignore[arg-type]
-    keys = jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32))
-    states = jax.jit(each(experiment.init, (0,), SEEDS), out_shardings=laid_out)(keys)
-    began = time.monotonic()
-    one = each(lambda state: trial(state, experiment, config.evaluation), (SEEDS,), (SEEDS, 0))
-    lowered = jax.jit(one, out_shardings=(laid_out, own)).lower(states)
-    how = compiler_options(LASTING)
-    program = lowered.compile(compiler_options=how)
-    # A program of its own, so that looking changes no number.
-    infos = lowered.out_info[1] if own is None else described(lowered.out_info[1], own)
-    look = jax.jit(each(partial(diagnosed, experiment), (SEEDS, SEEDS, 0)), out_shardings=own)
-    look = look.lower(states, states, infos).compile(compiler_options=how)
-    compiled = time.monotonic()
-    infos, looks, result = [], [], {}
-    for count in range(1, config.trials + 1):
-        before = states
-        states, info = jax.block_until_ready(program(states))
-        infos.append(jax.tree.map(np.asarray, info))
-        looks.append(jax.tree.map(np.asarray, look(before, states, info)))
-        result = curves(config, seeds, stacked(infos), experiment.task) | diagnostics(*stacked(looks))
-        result |= {"compile_seconds": round(compiled - began, 1), "run_seconds": round(time.monotonic() - compiled, 1)}
+    def keep(latest: dict[str, Any]) -> None:
+        result.update(latest)
         if path is not None:
             write(path, result)
-        cost, success = (np.asarray(result[name], float)[:, -1] for name in ("mean_cost", "success_rate"))
-        solved = np.mean(success >= SOLVED)
-        print(f"trial {count}  cost {cost.mean():.3f}  solved {solved:.0%}", file=sys.stderr, flush=True)
+
+    with opened(config, seeds, sharding.evenly(len(seeds))) as job:
+        job = job._replace(writer=one_json(config, seeds, job.experiment.task, keep))
+        learn(job, first_states(job))
     return result
 
 
-def diagnosed(experiment: Experiment, before: RunState, after: RunState, info: TrialInfo) -> tuple[Array, Array]:
-    """Of one trial: calibration of the model on the episode it had not seen, and the objective on fresh scenarios.
+def one_json(config: Config, seeds: list[int], task: Task, keep: Callable[[dict[str, Any]], None]) -> Writer:
+    """A writer that hands the curves of all seeds so far to `keep` after each trial, with how long they took.
 
-    NaN where there is none: before the first fit, and of a trial without a search.
+    A seed whose model or policy diverges has null in its curves from then on; the study goes on.
     """
-    fresh = jnp.mean(experiment.imagine(after)[1])
-    return experiment.calibrate(before, info.trajectory), jnp.where(jnp.isnan(info.fit.loss), jnp.nan, fresh)
+    trials: list[list[Row]] = []
+    began = time.monotonic()
+
+    def trial(number: int, states: RunState, rows: list[Row]) -> None:
+        trials.append(rows)
+        compiling = sum(rows[0]["seconds"]["compile"] for rows in trials)
+        running = time.monotonic() - began - compiling
+        clock = {"compile_seconds": round(compiling, 1), "run_seconds": round(running, 1)}
+        keep(curves(config, seeds, trials, task) | clock)
+
+    return writers.nothing(len(seeds))._replace(trial=trial)
 
 
-def stacked(trials: list[Any]) -> Any:
-    """One tree [S, T, ...] of the trials' [S, ...]."""
-    return jax.tree.map(lambda *leaves: np.stack(leaves, 1), *trials)
+def curves(config: Config, seeds: list[int], trials: list[list[Row]], task: Task) -> dict[str, Any]:
+    """What is kept of the trials so far, each a row a seed (docs/method.md 20 explains the curves)."""
 
+    def of(name: str) -> list[list[Any]]:
+        return [[rows[index][name] for rows in trials] for index in range(len(seeds))]
 
-def curves(config: Config, seeds: list[int], info: TrialInfo, task: Task) -> dict[str, Any]:
-    """What is kept of the trials so far [S, T, ...]."""
-    costs = info.evaluation  # [S, T, E, H]
     return {
         "seeds": seeds,
-        "plant_seconds": np.round(task.horizon * task.dt * np.arange(1, costs.shape[1] + 1), 6).tolist(),
-        "mean_cost": short(costs.mean((2, 3))),
-        "success_rate": succeeded(costs, task).mean(2).tolist(),
-        "episode_cost": short(info.trajectory.cost.mean(2)),
-        "objective_last": short(info.search.objective[..., -1]),
-        "saturated": short(saturated(info.trajectory.u, task)),
-        "skipped_updates": info.search.skipped.tolist(),
+        "plant_seconds": np.round(task.horizon * task.dt * np.arange(1, len(trials) + 1), 6).tolist(),
+        **{name: short(of(name)) for name in ROUNDED},
+        "success_rate": of("success_rate"),
+        "skipped_updates": of("skipped_updates"),
         "config": config_io.plain(config),
     }
 
 
-def diagnostics(calibration: Any, fresh: Any) -> dict[str, Any]:
-    """`diagnosed` of the trials so far [S, T]."""
-    return {"calibration": short(calibration), "objective_fresh": short(fresh)}
-
-
 def short(values: Any) -> list[list[float | None]]:
     """Numbers [S, T] to four decimals; None for one that is not known, because JSON has no NaN."""
-    return [[None if np.isnan(v) else round(float(v), 4) for v in row] for row in np.asarray(values)]
+    return [[None if np.isnan(v) else round(float(v), 4) for v in row] for row in np.asarray(values, float)]
 
 
 def write(path: Path, result: dict[str, Any]) -> None:

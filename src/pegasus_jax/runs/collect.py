@@ -1,0 +1,99 @@
+"""Line 3 of Alg. 1 as a job does it: the episodes of a trial, each made durable before anything else is done with it."""
+
+from contextlib import nullcontext
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax import episode, interrupt
+from pegasus_jax.checks import RunError
+from pegasus_jax.experiment import COLLECT, trial_key
+from pegasus_jax.runs.job import Job
+from pegasus_jax.runs.programs import fetched, leads
+from pegasus_jax.tasks import user_code
+from pegasus_jax.types import Episode, RunState, Task, Trajectory
+
+
+def collected(job: Job, states: RunState, trial: int) -> list[Episode]:
+    """The episodes [S] of a trial: those that the writer has as they are, the others run on the plant and handed to it.
+
+    Raises RunError where one failed, after it was kept as far as it came, or is not made of finite numbers; and
+    KeyboardInterrupt where a signal ended it.
+    """
+    task, known = job.experiment.task, job.writer.known(trial)
+    missing = any(ran is None for ran in known)
+    last = job.config.trials  # the one more episode that a run may end with is shown as the end of its last trial
+    job.display.phase(min(trial, last), "collect" if missing else "read", float(trial > last))
+    if missing:
+        # What was measured on an environment is stored before a signal is heard again.
+        with interrupt.held() if task.environment is not None else nullcontext():
+            known = gathered(job, states, trial, known)
+    episodes = []
+    for index, ran in enumerate(ran for ran in known if ran is not None):
+        now = costed(job, ran, trial)
+        if now is not ran and task.environment is None and leads():  # a damaged file, or a cost that its user mended
+            where = job.writer.where(index, trial)
+            job.display.line(f"{where} has costs that are not finite; counted again from its observations")
+        episodes.append(now)
+    return episodes
+
+
+def gathered(job: Job, states: RunState, trial: int, known: list[Episode | None]) -> list[Episode]:
+    """The known episodes, and for those that are not, ones that are run on the plant and handed to the writer."""
+    task, random = job.experiment.task, job.random(trial)
+    keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(fetched(states.key))
+    fresh = job.program.collect(keys, states.policy.params, random)
+    policies = policies_that_run(job, states, trial)
+    for index, ran in enumerate(fresh):
+        if known[index] is None:
+            check_finite(job, ran.trajectory, trial)
+            job.writer.episode(index, trial, ran, int(policies[index]))
+            failed(ran, task, job.writer.advice(index))
+    return [old if old is not None else new for old, new in zip(known, fresh, strict=True)]
+
+
+def policies_that_run(job: Job, states: RunState, trial: int) -> np.ndarray:
+    """The trial [S] after which the policy that runs in this trial's episode was learned; 0 for random controls."""
+    learned = np.asarray(fetched(states.policy_trial))
+    return np.zeros_like(learned) if job.random(trial) else learned
+
+
+def check_finite(job: Job, trajectory: Trajectory, trial: int) -> None:
+    """Tell the writer, with trial and entry, of an episode that no model can learn from."""
+    x = np.asarray(trajectory.x)
+    for t, i in np.argwhere(~np.isfinite(x))[:1]:
+        job.writer.problem(
+            f"trial {trial}: {job.experiment.task.state_names[i]} is {x[t, i]} after {t} control periods of its"
+            " episode; the plant's simulation diverged: a smaller time step or softer parts may help"
+        )
+
+
+def costed(job: Job, ran: Episode, trial: int) -> Episode:
+    """The episode with its costs, which are counted again where they are not finite: the user may have mended the cost.
+
+    Where they are not finite then either, the writer is told, with trial and observation.
+    """
+    if np.isfinite(ran.trajectory.cost).all():
+        return ran
+    x = np.asarray(ran.trajectory.x)
+    cost = np.asarray(jax.vmap(job.experiment.task.cost)(jnp.asarray(x[1:])))
+    for (t,) in np.argwhere(~np.isfinite(cost))[:1]:
+        found = f"the cost of the observation {x[t + 1].tolist()} is {cost[t]}"
+        job.writer.problem(f"trial {trial}: {found}; mend the cost")
+    return ran._replace(trajectory=ran.trajectory._replace(cost=cost))
+
+
+def failed(ran: Episode, task: Task, advice: str = "") -> None:
+    """Raise what ended an episode on an environment before its time: RunError in one line, or the signal itself."""
+    if isinstance(ran.error, KeyboardInterrupt):
+        raise ran.error
+    if ran.error is not None:
+        kept = f"; its {len(ran.trajectory.u)} rows are kept" if len(ran.trajectory.u) else ""
+        raise RunError(f"{task.name} failed in an episode, {user_code.told(ran.error)}{kept}{advice}") from ran.error
+
+
+def stacked(episodes: list[Episode], task: Task) -> Trajectory:
+    """The episodes as one Trajectory [S, ...], each in arrays of H periods where the task may end early."""
+    shaped = [episode.padded(ran.trajectory, task.horizon) if task.may_end else ran.trajectory for ran in episodes]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *shaped)

@@ -1,0 +1,68 @@
+"""How good policies are on their plant, by episodes that never become data."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax import episode, tasks
+from pegasus_jax.runs import checkpoint, restore
+from pegasus_jax.runs.collect import failed
+from pegasus_jax.runs.programs import Program
+from pegasus_jax.types import Key, Params, Task
+
+UNMEASURED: dict[str, Any] = {"mean_cost": None, "success_rate": None}  # what `evaluate` says without episodes
+
+
+def evaluate(keys: Key, params: Params, task: Task, program: Program, episodes: int) -> list[dict[str, Any]]:
+    """Mean cost a step and success rate of each seed [S], over fresh episodes, not data (docs/reference.md 10)."""
+    if not episodes:
+        return [UNMEASURED] * len(keys)
+    keys = jax.vmap(lambda key: jax.random.split(key, episodes))(keys)
+    costs = program.evaluate(keys, params) if task.environment is None else driven(keys, params, task, program)
+    return [
+        {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(success))}
+        for cost, success in zip(costs, episode.succeeded(costs, task), strict=True)
+    ]
+
+
+def driven(keys: Key, params: Params, task: Task, program: Program) -> np.ndarray:
+    """Costs [S, E, H] of episodes on an environment, the periods that an early end left out included."""
+    costs = []
+    for some in jnp.swapaxes(keys, 0, 1):
+        for ran in program.collect(some, params, False, purpose="evaluate"):
+            failed(ran, task)
+            costs.append(episode.charged(ran.trajectory.cost, task))
+    return np.reshape(costs, (keys.shape[1], keys.shape[0], task.horizon)).swapaxes(0, 1)
+
+
+def saturated(u: Any, task: Task) -> np.ndarray:
+    """Fraction of the controls [..., H, U] of episodes that are within 1 % of a limit [...]."""
+    low, high = np.asarray(task.control_low), np.asarray(task.control_high)
+    margin = 0.01 * (high - low)
+    u = np.asarray(u)
+    return np.mean((u < low + margin) | (u > high - margin), axis=(-2, -1))
+
+
+def evaluate_run(
+    run: Path,
+    episodes: int,
+    seed: int,
+    trial: restore.Trial = restore.LAST,
+    mjcf: str | None = None,
+) -> dict[str, Any]:
+    """How the policy of a trial does on its plant, and the run's fingerprint then.
+
+    `mjcf` is where the model's file is now, if it is not where it was.
+    """
+    _, experiment, state = restore.ready(run, trial, mjcf)
+    program = Program(experiment, 1)
+    params = jax.tree.map(lambda leaf: leaf[None], state.policy.params)
+    keys = jax.random.key(seed)[None]
+    try:
+        (result,) = evaluate(keys, params, experiment.task, program, episodes)
+    finally:
+        tasks.close(experiment.task)
+    return {"trial": int(state.trial), "episodes": episodes, **result, "fingerprint": checkpoint.fingerprint(state)}

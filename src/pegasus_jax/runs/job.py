@@ -1,0 +1,77 @@
+"""What the loop of Alg. 1 works with: the config, its compiled experiment, who shows progress, and who writes."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.sharding import Mesh
+
+from pegasus_jax import tasks
+from pegasus_jax.builder import build, set_precision
+from pegasus_jax.config import Config
+from pegasus_jax.learn.data import grow
+from pegasus_jax.runs import restore, writers
+from pegasus_jax.runs.display import Display
+from pegasus_jax.runs.programs import Program, leads
+from pegasus_jax.runs.writers import Writer
+from pegasus_jax.types import Experiment, RunState
+
+
+class Job(NamedTuple):
+    """S seeds of one config as one program."""
+
+    config: Config
+    seeds: Sequence[int]
+    experiment: Experiment
+    program: Program
+    display: Display
+    writer: Writer
+
+    def random(self, trial: int) -> bool:
+        """Whether the episode of this trial is of random controls."""
+        return trial <= self.config.explore.trials
+
+
+@contextmanager
+def opened(config: Config, seeds: Sequence[int], mesh: Mesh | None = None) -> Iterator[Job]:
+    """A job whose display is up and whose environment is closed afterwards. It writes nothing until told where.
+
+    JAX has the config's precision from here on.
+    """
+    set_precision(config)
+    experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
+    try:
+        program = Program(experiment, config.search.steps, len(seeds), mesh)
+        display = Display(config.trials, quiet=not leads())
+        with display.running():
+            program.on_compile = display.compiling
+            yield Job(config, seeds, experiment, program, display, writers.nothing(len(seeds)))
+    finally:
+        tasks.close(experiment.task)
+
+
+def first_states(job: Job, stored: RunState | None = None, changed: bool = False) -> RunState:
+    """The states [S, ...] that a job begins with: fresh ones, or `stored`, made to fit the config.
+
+    With `changed` settings of fit or search the optimizers may have to start again. The search, which takes longest
+    to compile, begins to be compiled here.
+    """
+    config = job.config
+    done = 0 if stored is None else int(stored.trial[0])
+    if max(done + 1, config.explore.trials) <= config.trials:  # else no policy is searched
+        job.program.prepare("search")
+    keys = jnp.stack([jax.random.key(seed) for seed in job.seeds])
+    if stored is None:
+        states = job.program("init", keys)
+    elif changed or any(learner.optimizer is None for learner in (stored.model, stored.policy)):
+        states = restore.suited(stored, job.program("init", keys))
+    else:
+        states = stored
+    room = config.trials * job.experiment.task.horizon
+    if room > states.data.x.shape[1]:
+        states = states._replace(data=jax.vmap(partial(grow, capacity=room))(states.data))
+    return states

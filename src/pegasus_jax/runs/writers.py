@@ -1,0 +1,101 @@
+"""Where the results of a job go: a `Writer` is a value, so the loop of Alg. 1 (train.py) knows of no files.
+
+`run_folders` keeps everything in a folder per seed (store.py), `nothing` keeps nothing; a study's writer, which makes
+one JSON of all seeds, is in studies/study.py.
+"""
+
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple, NoReturn
+
+import jax
+
+from pegasus_jax.checks import RunError
+from pegasus_jax.config import Config
+from pegasus_jax.runs import checkpoint, config_io, store
+from pegasus_jax.runs.programs import fetched, leads
+from pegasus_jax.runs.tensorboard import Board
+from pegasus_jax.types import Episode, RunState, Successor, Task
+
+Row = dict[str, Any]  # a trial of one seed in numbers, as in trials.jsonl
+
+
+class Writer(NamedTuple):
+    """What is done with the results of S seeds. Every process of a job calls each function; one of them writes."""
+
+    begin: Callable[[int], None]  # before the first trial of this job: so many trials are done already
+    known: Callable[[int], list[Episode | None]]  # trial -> its episodes [S] that are kept already, None for others
+    episode: Callable[[int, int, Episode, int], None]  # index of the seed, trial, episode, policy that ran (0: random)
+    imagined: Callable[[int, Successor], None]  # trial, what its new policy is expected to do [S, ...]
+    trial: Callable[[int, RunState, list[Row]], None]  # trial, the states after it [S, ...], a row a seed
+    where: Callable[[int, int], str]  # index of the seed, trial -> what to call that episode in a message
+    advice: Callable[[int], str]  # index of the seed -> what follows the message of an episode that failed
+    problem: Callable[[str], None]  # hears why nothing can be learned; raises where the job is to end with that
+
+
+def nothing(seeds: int) -> Writer:
+    """Keeps nothing, says problems on standard error, and goes on: one seed's failure is not that of the others."""
+    return Writer(
+        begin=lambda done: None,
+        known=lambda trial: [None] * seeds,
+        episode=lambda index, trial, ran, policy: None,
+        imagined=lambda trial, successor: None,
+        trial=lambda trial, states, rows: None,
+        where=lambda index, trial: f"the episode of trial {trial}, seed number {index + 1},",
+        advice=lambda index: "",
+        problem=lambda text: print(text, file=sys.stderr, flush=True),
+    )
+
+
+def run_folders(runs: dict[int, Path], config: Config, task: Task, command: str, say: Callable[[str], None]) -> Writer:
+    """Everything in a folder per seed, `runs`, so that each can be resumed (store.py says what is in it).
+
+    Called by who holds the folders' locks. `command` is what the user typed, `say` prints a line.
+    """
+    folders = list(runs.values())
+    boards: list[Board] = []
+
+    def begin(done: int) -> None:
+        for seed, run in runs.items() if leads() else ():
+            config_io.save(replace(config, seed=seed), run / "config.yaml")
+            store.note(run, command, done, task)
+            store.write_trials(run, store.readable_trials(run)[0][:done])
+            boards.append(Board(run / "tensorboard", done + 1, say))
+
+    def episode(index: int, trial: int, ran: Episode, policy: int) -> None:
+        if leads() and len(ran.trajectory.u):
+            store.save_episode(folders[index], trial, ran.trajectory, task, policy=policy, ended=ran.ended)
+
+    def imagined(trial: int, successor: Successor) -> None:
+        for index, run in enumerate(folders if leads() else ()):
+            store.save_imagined(run, trial, part(successor.rollout, index), successor.cost[index])
+
+    def trial(number: int, states: RunState, rows: list[Row]) -> None:
+        whole = fetched(states)
+        for index, board in enumerate(boards):
+            store.write_trials(folders[index], [*store.trials(folders[index]), rows[index]])
+            board.add(rows[index])
+            checkpoint.save(folders[index], number, part(whole, index))
+
+    return Writer(
+        begin=begin,
+        known=lambda trial: [store.load_episode(run, trial) for run in folders],
+        episode=episode,
+        imagined=imagined,
+        trial=trial,
+        where=lambda index, trial: str(store.episode_path(folders[index], trial)),
+        advice=lambda index: f"; resume={folders[index]} goes on",
+        problem=refuse,
+    )
+
+
+def refuse(text: str) -> NoReturn:
+    """End the job: raises RunError with this line."""
+    raise RunError(text)
+
+
+def part(tree: Any, index: int) -> Any:
+    """One seed's part of a tree of arrays [S, ...]."""
+    return jax.tree.map(lambda leaf: leaf[index], tree)
