@@ -124,7 +124,7 @@ def test_one_thread_imagines_few_particles(seeds: int, particles: int | None, th
     """As the system counts XLA's threads, in a process of its own; a machine of one processor has one in any case."""
     code = f"""
 import pathlib, jax
-from pegasus_jax.program import share_processors
+from pegasus_jax.runs.programs import share_processors
 share_processors({seeds}, {particles})
 jax.block_until_ready(jax.jit(lambda: jax.numpy.ones(3))())
 print(sum("XLAEigen" in path.read_text() for path in pathlib.Path("/proc/self/task").glob("*/comm")))
