@@ -1,4 +1,4 @@
-"""Line 3 of Alg. 1 as a job does it: the episodes of a trial, each made durable before anything else is done with it."""
+"""Line 3 of Alg. 1 as a job does it: the episodes of a trial, each durable before anything is learned from it."""
 
 from contextlib import nullcontext
 
