@@ -270,9 +270,9 @@ def test_the_settings_of_pilcos_search_reach_its_objective():
     of_cart = partial(value, cart(horizon=3))
     plain = of_cart()
     np.testing.assert_allclose(of_cart(aggregate="total"), 3 * plain, rtol=1e-4)
-    values = [of_cart(discount=0.5), *(of_cart(**{f"{name}_noise": 1.0}) for name in ("policy", "state", "cost"))]
+    values = [of_cart(**{f"{name}_noise": 1.0}) for name in ("policy", "state")]
     assert all(abs(value - plain) > 1e-4 for value in values), (plain, values)
-    assert len(set(values)) == 4
+    assert values[0] != values[1]
     # And so does a cost that is only a function.
     own = value(cart(horizon=3)._replace(expected_cost=None))
     assert own != plain

@@ -10,7 +10,8 @@ pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that 
                                                 fit.* or search.* settings
 
   task=cartpole         what to learn: {tasks}
-  preset=NAME           begin with these settings instead of the task's own, which are preset=TASK: {presets}
+  preset=NAME           begin with these settings instead of the task's own, which are preset=TASK: {presets};
+                        or, with the paper's network, cartpole_network, double_cartpole_network, swimmer_..._network
   model=log_normal      dynamics model: {models}
                         (default: the one of the task's preset, which learns it best; any other begins with
                         preset=TASK_network, whose settings do not depend on that one)
@@ -124,10 +125,11 @@ def help_of(text: str, words: Sequence[str]) -> str:
     if "{settings}" not in text:
         return text
     from pegasus_jax.config import KINDS, TASKS
-    from pegasus_jax.presets import ALGORITHMS, MODELS, POLICIES, PRESETS
+    from pegasus_jax.presets import ALGORITHMS, MODELS, NETWORKS, POLICIES, PRESETS
     from pegasus_jax.runs import config_io
 
-    named = dict(tasks=TASKS, presets=PRESETS, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
+    presets = [name for name in PRESETS if name not in NETWORKS]
+    named = dict(tasks=TASKS, presets=presets, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
     lists = {name: ", ".join(values) for name, values in named.items()}
     _, dotted = config_io.split([word for word in words if word not in WORDS], OPTIONS)
     config = config_io.parse(dotted, OPTIONS)
