@@ -1,4 +1,4 @@
-"""A feedback law for the swimmer: a person's idea of the manoeuvres, its gains found by search.
+"""A feedback law for the swimmer: a person's idea of the maneuvers, its gains found by search.
 
 It sees only the observation. Point the nose ahead, up or down as the depth's error asks; turn the roll angle, or its
 rate, to its aim by opposite offsets of the left and right flippers; pitch by common (two legs) or front against rear
@@ -60,7 +60,7 @@ def feedback(gains: Array, x: Array, task: str, legs: int, depth: float, rate: f
 def episodes(plant: Plant, tasks: Sequence[str], which: Array, gains: Array, starts: Swimming) -> Array:
     """Observations [N, H, D] of N episodes of 20 s at once: episode n does `tasks[which[n]]` with gains [n].
 
-    The motion is the same for all manoeuvres, so any swimmer with as many legs serves as the plant.
+    The motion is the same for all maneuvers, so any swimmer with as many legs serves as the plant.
     """
     legs = 2 if len(plant.control_low) == 4 else 6
     depths = {task: 2.0 if task == "depth_change" else 1.0 for task in tasks}

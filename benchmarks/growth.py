@@ -59,12 +59,12 @@ def costs(method: dict[str, str], rows: int, words: dict[str, str], repeats: int
     state = jax.jit(experiment.init)(jax.random.key(0))._replace(data=data, trial=jnp.int32(1))
     params, prepared = state.model.params, jax.jit(dynamics.prepare)(data)
     batch = Batch(*(column[:100] for column in data[:3]))
-    belief = jax.jit(dynamics.condition)(params, data)
+    posterior = jax.jit(dynamics.posterior)(params, data)
     keys = jax.random.split(jax.random.key(1), PARTICLES)
     timed: dict[str, tuple[Any, ...]] = {
         "loss": (jax.value_and_grad(dynamics.loss), params, keys[0], batch, prepared),
-        "condition": (dynamics.condition, params, data),
-        "draw": (jax.vmap(dynamics.sample, (0, None)), keys, belief),
+        "condition": (dynamics.posterior, params, data),
+        "draw": (jax.vmap(dynamics.sample, (0, None)), keys, posterior),
         "search": (partial(experiment.search, steps=STEPS), state, jnp.int32(0)),
     }
     times = in_turn({name: compiled(*call)[0] for name, call in timed.items()}, repeats)

@@ -55,13 +55,13 @@ def errors(config: Config, counts: list[int]) -> dict[str, Any]:
 
     @jax.jit
     def asked(state: RunState) -> tuple[Array, Array]:
-        belief = dynamics.condition(state.model.params, state.data)
-        one = partial(one_step_errors, jax.random.key(1), belief, dynamics=dynamics, angles=task.angles)
+        posterior = dynamics.posterior(state.model.params, state.data)
+        one = partial(one_step_errors, jax.random.key(1), posterior, dynamics=dynamics, angles=task.angles)
         return jax.vmap(one)(tests)  # [N, H, D] each
 
     state, fit, found = jax.jit(experiment.init)(jax.random.key(config.seed)), jax.jit(experiment.fit), {}
     for count in range(1, counts[-1] + 1):
-        state = experiment.absorb(state, jax.tree.map(lambda leaf: leaf[count - 1], walks))  # noqa: B023
+        state = experiment.add_episode(state, jax.tree.map(lambda leaf: leaf[count - 1], walks))  # noqa: B023
         if count in counts:
             state, _ = fit(state)
             error, variance = asked(state)

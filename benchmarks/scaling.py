@@ -59,7 +59,7 @@ def parts_of(experiment: Experiment) -> dict[str, Callable[[RunState], Any]]:
 
     def collect(state: RunState) -> tuple[RunState, Array]:
         trajectory = experiment.collect(state)
-        return experiment.absorb(state, trajectory), trajectory.cost
+        return experiment.add_episode(state, trajectory), trajectory.cost
 
     def evaluate(state: RunState) -> tuple[RunState, Array]:
         keys = jax.random.split(trial_key(state.key, state.trial, EVALUATE), EPISODES)

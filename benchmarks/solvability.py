@@ -1,4 +1,4 @@
-"""Can the swimmer's eight manoeuvres be done at all? A feedback on the observation, at the control rate and limits.
+"""Can the swimmer's eight maneuvers be done at all? A feedback on the observation, at the control rate and limits.
 
     python -m benchmarks.solvability [starts=16]
 
@@ -39,7 +39,7 @@ STUDY: dict[tuple[int, str], tuple[float, ...]] = {
 
 
 def tracking(task: str, legs: int, x: np.ndarray) -> dict[str, float]:
-    """The columns for observations [N, H, D] of one manoeuvre."""
+    """The columns for observations [N, H, D] of one maneuver."""
     error = swimmer(task, legs, cost="authors").error  # pyright: ignore[reportArgumentType]
     squares = np.sum(np.asarray(jax.vmap(jax.vmap(error))(jnp.asarray(x))) ** 2, axis=-1)
     late = x[:, x.shape[1] // 2 :]
@@ -53,7 +53,7 @@ def tracking(task: str, legs: int, x: np.ndarray) -> dict[str, float]:
 
 
 def solvability(legs: int, starts: int) -> dict[str, dict[str, float]]:
-    """Task -> columns, for the four manoeuvres at once."""
+    """Task -> columns, for the four maneuvers at once."""
     tasks = [task for some, task in GAINS if some == legs]
     plant = swimmer("knife_edge", legs)  # pyright: ignore[reportArgumentType]
     states = jax.vmap(plant.reset)(jax.random.split(jax.random.key(77), starts))

@@ -60,7 +60,7 @@ def search_step(work: Workload, repeats: int) -> Row:
 def quality(work: Workload) -> Row:
     """The objective, its error and its gradient's, relative to float64's and to the gradient's norm."""
     value = jax.value_and_grad(work.objective)
-    given = (work.state.policy.params, work.belief, work.scenarios)
+    given = (work.state.policy.params, work.posterior, work.scenarios)
     ours, gradient = jax.jit(value)(*given)
     with jax.enable_x64(True):
         exact, exact_gradient = jax.jit(value)(*jax.tree.map(widened, given))
@@ -85,14 +85,14 @@ def trial_parts(config: Config, repeats: int) -> dict[str, Row]:
     experiment = build(config)
     state = jax.jit(experiment.init)(jax.random.key(config.seed))
     began = clock()
-    collect, absorb = jax.jit(experiment.collect), jax.jit(experiment.absorb)
-    state = absorb(state, collect(state))
+    collect, add_episode = jax.jit(experiment.collect), jax.jit(experiment.add_episode)
+    state = add_episode(state, collect(state))
     fit, search = (jax.jit(partial(part, steps=1)) for part in (experiment.fit, experiment.search))
     jax.block_until_ready(search(fit(state)[0])[0])
     first = clock() - began
 
     def trial(state: Any) -> Any:
-        state = experiment.absorb(state, experiment.collect(state))
+        state = experiment.add_episode(state, experiment.collect(state))
         state, _ = experiment.fit(state, steps=FIT_STEPS)
         return experiment.search(state, steps=STEPS)[0]
 
@@ -127,7 +127,7 @@ def gradient(work: Workload, repeats: int, seeds: int) -> Row:
     """The objective and its gradient for policies of several seeds at once."""
     params = jax.tree.map(lambda leaf: jnp.stack([leaf] * seeds), work.state.policy.params)
     value = jax.vmap(jax.value_and_grad(work.objective), (0, None, None))
-    return measure(value, params, work.belief, work.scenarios, repeats=repeats)
+    return measure(value, params, work.posterior, work.scenarios, repeats=repeats)
 
 
 def suite(words: Words, repeats: int, quick: bool) -> dict[str, Row]:

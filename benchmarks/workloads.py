@@ -58,7 +58,7 @@ class Workload(NamedTuple):
     config: Config
     experiment: Experiment
     state: RunState  # with EPISODES of data and a model fitted for a moment
-    belief: Params
+    posterior: Params
     scenarios: Scenarios
     objective: Callable[[Params, Params, Scenarios], Array]
 
@@ -79,17 +79,17 @@ def workload(words: dict[str, str], horizon: int | None = None) -> Workload:
     task = task._replace(cost=near(task), horizon=horizon or task.horizon)
     experiment = compose(config, task)
     state = jax.jit(experiment.init)(jax.random.key(config.seed))
-    absorb = jax.jit(experiment.absorb)
+    add_episode = jax.jit(experiment.add_episode)
     for seed in range(EPISODES):
-        state = absorb(state, wandering(task, seed))
+        state = add_episode(state, wandering(task, seed))
     state, _ = jax.jit(partial(experiment.fit, steps=200))(state)
     dynamics, policy = experiment.dynamics, experiment.policy
-    belief = jax.jit(dynamics.condition)(state.model.params, state.data)
+    posterior = jax.jit(dynamics.posterior)(state.model.params, state.data)
     blocks = blocks_of(config.search.particles, task, dynamics, policy)
-    scenarios = jax.jit(partial(draw, blocks=blocks, period=Period()))(jax.random.key(1), 0, belief)
+    scenarios = jax.jit(partial(draw, blocks=blocks, period=Period()))(jax.random.key(1), 0, posterior)
     match = matching.match if config.search.match else matching.keep
     value = partial(objective, dynamics=dynamics, policy=policy, match=match, cost=costs.of_particles(task.cost))
-    return Workload(config, experiment, state, belief, scenarios, value)
+    return Workload(config, experiment, state, posterior, scenarios, value)
 
 
 def goal(task: Task) -> Array:

@@ -22,7 +22,7 @@ from hypothesis import settings
 # known, in jax 0.10 and 0.12: vmap of a scan over split keys. probes.unchecked switches the check off for that.
 jax.config.update("jax_debug_key_reuse", True)
 
-# Derandomised: a failure in CI is the same failure here. No deadline: the first example compiles.
+# Derandomized: a failure in CI is the same failure here. No deadline: the first example compiles.
 settings.register_profile("repository", deadline=None, derandomize=True, max_examples=25)
 settings.load_profile("repository")
 

@@ -180,8 +180,8 @@ def known(plant: Linear, noise_std: float = 0.0) -> Dynamics:
     """The true dynamics as a model: nothing to fit, nothing random but the noise of the prediction."""
     states = plant.a.shape[0]
 
-    def apply(belief, draw, x, u):
-        del belief, draw
+    def apply(posterior, draw, x, u):
+        del posterior, draw
         mean = (jnp.asarray(plant.a, x.dtype) - jnp.eye(states, dtype=x.dtype)) @ x + jnp.asarray(plant.b, x.dtype) @ u
         return Prediction(mean, jnp.full((states,), noise_std, x.dtype))
 
@@ -189,8 +189,8 @@ def known(plant: Linear, noise_std: float = 0.0) -> Dynamics:
         init=lambda key: {},
         prepare=lambda data: None,
         loss=lambda params, key, batch, context: jnp.zeros(()),
-        condition=lambda params, data: None,
-        sample=lambda key, belief: jnp.zeros(()),
+        posterior=lambda params, data: None,
+        sample=lambda key, posterior: jnp.zeros(()),
         apply=apply,
     )
 
@@ -216,9 +216,9 @@ def regression(states: int, controls: int) -> Dynamics:
         init=lambda key: jax.random.normal(key, shape),
         prepare=lambda data: 1 + 0 * jnp.mean(data.y),
         loss=loss,
-        condition=lambda params, data: params,
-        sample=lambda key, belief: belief * (1 + 0.1 * jax.random.normal(key, shape)),
-        apply=lambda belief, draw, x, u: Prediction(jnp.concatenate([x, u]) @ draw, 0.05 + 0 * x),
+        posterior=lambda params, data: params,
+        sample=lambda key, posterior: posterior * (1 + 0.1 * jax.random.normal(key, shape)),
+        apply=lambda posterior, draw, x, u: Prediction(jnp.concatenate([x, u]) @ draw, 0.05 + 0 * x),
     )
 
 
@@ -237,13 +237,13 @@ def noisy_linear_policy(task: Task) -> Policy:
 
 
 def balanced_start(plant: Linear, particles: int) -> Any:
-    """(key, belief) -> first states [K, D] with exactly the plant's mean and covariance."""
+    """(key, posterior) -> first states [K, D] with exactly the plant's mean and covariance."""
 
-    def start(key, belief):
-        from pegasus_jax.math.linalg import standardise
+    def start(key, posterior):
+        from pegasus_jax.math.linalg import standardize
 
         z = jax.random.normal(key, (particles, plant.mean.shape[0]))
-        return plant.mean.astype(z.dtype) + standardise(z) * plant.std.astype(z.dtype)
+        return plant.mean.astype(z.dtype) + standardize(z) * plant.std.astype(z.dtype)
 
     return start
 
@@ -257,7 +257,7 @@ class Rig(NamedTuple):
     dynamics: Dynamics
     policy: Policy
     blocks: scenarios.Blocks
-    belief: Any
+    posterior: Any
     params: Any  # of the policy
     cost: Any  # [H, K, D] -> [H, K]
     particles: int
@@ -321,13 +321,13 @@ def make_rig(particles: int, horizon: int, heteroscedastic: bool = True) -> Rig:
 
     @jax.jit  # operation by operation it would take seconds
     def start(data):
-        return dynamics.condition(dynamics.init(jax.random.key(1)), data), policy.init(jax.random.key(2))
+        return dynamics.posterior(dynamics.init(jax.random.key(1)), data), policy.init(jax.random.key(2))
 
-    belief, params = start(experience())
+    posterior, params = start(experience())
     wide = lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf  # noqa: E731
-    belief, params = jax.tree.map(wide, (belief, params))  # flax makes float32 kernels even where float64 is on
+    posterior, params = jax.tree.map(wide, (posterior, params))  # flax makes float32 kernels even where float64 is on
     distance = cost.of_particles(cost.saturating(lambda x: jnp.array([x[0], x[1], jnp.sin(x[2])]), 1.0))
-    return Rig(dynamics, policy, blocks, belief, params, distance, particles, horizon)
+    return Rig(dynamics, policy, blocks, posterior, params, distance, particles, horizon)
 
 
 @cache

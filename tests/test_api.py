@@ -101,13 +101,13 @@ class Imagined(NamedTuple):
     """What a rollout and an objective take."""
 
     params: Any
-    belief: Any
+    posterior: Any
     scenarios: pg.Scenarios
 
 
 def imagined() -> Imagined:
-    belief = DYNAMICS.condition(DYNAMICS.init(key()), experience())
-    return Imagined(POLICY.init(key()), belief, pg.draw(key(), 0, belief, blocks=blocks(), period=pg.Period()))
+    posterior = DYNAMICS.posterior(DYNAMICS.init(key()), experience())
+    return Imagined(POLICY.init(key()), posterior, pg.draw(key(), 0, posterior, blocks=blocks(), period=pg.Period()))
 
 
 PIECES: dict[str, Any] = dict(dynamics=DYNAMICS, policy=POLICY, match=pg.matching.match)
@@ -148,7 +148,7 @@ def _() -> Any:
     experiment = pg.compose(config, TASK, **own)
     state = experiment.init(key())
     assert jax.tree.structure(state.model.optimizer) == jax.tree.structure(fitted.init(state.model.params))
-    state = experiment.absorb(state, experiment.collect(state))
+    state = experiment.add_episode(state, experiment.collect(state))
     searched, info = experiment.search(state)
     assert info == "searched"
     assert experiment.task.cost(X) == pytest.approx(2 * float(X @ X))
@@ -188,8 +188,8 @@ def _() -> Any:
 
 
 def predicted(model: pg.Dynamics) -> pg.Prediction:
-    belief = model.condition(model.init(key()), experience())
-    change = model.apply(belief, model.sample(key(), belief), X, CONTROL)
+    posterior = model.posterior(model.init(key()), experience())
+    change = model.apply(posterior, model.sample(key(), posterior), X, CONTROL)
     assert change.mean.shape == change.std.shape == (D,)
     return change
 
@@ -238,28 +238,28 @@ def _() -> Any:
 
 @example("gradient_search", "sampler")
 def _() -> Any:
-    params, belief, _ = imagined()
+    params, posterior, _ = imagined()
     optimizer, draws = optax.adam(1e-3), pg.sampler(blocks(), pg.Period())
     learner = pg.Learner(params, optimizer.init(params))
     how: dict[str, Any] = dict(objective=J, sampler=draws, optimizer=optimizer, steps=2)
-    learner, info = pg.gradient_search(key(), learner, belief, **how)
+    learner, info = pg.gradient_search(key(), learner, posterior, **how)
     assert info.objective.shape == (2,)
     return learner.params, info
 
 
 @example("search", "searcher", "search_table")
 def _() -> Any:
-    params, belief, _ = imagined()
+    params, posterior, _ = imagined()
     table = pg.search_table(2, init="better")
     assert isinstance(table, pg.SearchTable)
-    of_row = lambda params, belief, scenarios, row: J(params, belief, scenarios)  # noqa: E731
+    of_row = lambda params, posterior, scenarios, row: J(params, posterior, scenarios)  # noqa: E731
     problem = pg.Problem(of_row, pg.sampler(blocks(), pg.Period()), optax.adam(1e-3), table)
     found = pg.searcher(problem)
     learner = pg.Learner(params, found.init(params))
     assert isinstance(learner.optimizer, pg.SearchState)
     fresh = POLICY.init(jax.random.key(1))
-    by_hand = pg.search(key(), learner, belief, problem=problem, steps=2, fresh=fresh)
-    return by_hand[0].params, found.run(key(), learner, belief, steps=2, fresh=fresh)[1]
+    by_hand = pg.search(key(), learner, posterior, problem=problem, steps=2, fresh=fresh)
+    return by_hand[0].params, found.run(key(), learner, posterior, steps=2, fresh=fresh)[1]
 
 
 @example("preset")
@@ -330,7 +330,7 @@ def _() -> Any:
 def _() -> Any:
     made, configured = pg.tasks.make("cartpole"), pg.tasks.of_config(CONFIG)
     assert made.state_names == configured.state_names
-    with pytest.raises(pg.SettingError, match="did you mean 'cartpole'"):
+    with pytest.raises(pg.ConfigError, match="did you mean 'cartpole'"):
         pg.tasks.make("cartpol")
     return made.cost(jnp.zeros(4))
 
@@ -402,11 +402,11 @@ def test_what_a_signature_names_is_exported(name: str) -> None:
 
 
 def test_a_private_type_in_a_signature_is_found() -> None:
-    from pegasus_jax.models.bnn import Belief
+    from pegasus_jax.models.bnn import Posterior
 
-    def leaks(belief: Belief | None, many: Callable[[tuple[Belief, int]], pg.Batch]) -> pg.Rollout: ...
+    def leaks(posterior: Posterior | None, many: Callable[[tuple[Posterior, int]], pg.Batch]) -> pg.Rollout: ...
 
-    assert missing(leaks) == {"Belief"}
+    assert missing(leaks) == {"Posterior"}
 
 
 def test_names_are_complete_and_others_are_refused() -> None:
@@ -440,7 +440,7 @@ def test_a_rollout_names_the_part_of_the_scenarios_that_is_wrong(part: str, chan
     given = imagined()
     wrong = given.scenarios._replace(**{part: change(given.scenarios)})
     with pytest.raises(ValueError, match=f"^{message}"):
-        jax.eval_shape(partial(pg.rollout, **PIECES), given.params, given.belief, wrong)
+        jax.eval_shape(partial(pg.rollout, **PIECES), given.params, given.posterior, wrong)
 
 
 PIECES_THAT_ARE_WRONG = [
@@ -471,9 +471,9 @@ def test_an_episode_names_what_is_wrong_with_it() -> None:
     experiment = pg.compose(CONFIG, TASK)
     state, good = experiment.init(key()), trajectory()
     with pytest.raises(ValueError, match=r"an episode's u has shape \(4, 2\); expected \(4, 1\)"):
-        experiment.absorb(state, good._replace(u=jnp.zeros((H, 2))))
+        experiment.add_episode(state, good._replace(u=jnp.zeros((H, 2))))
     with pytest.raises(ValueError, match=r"an episode's x is of int32"):
-        experiment.absorb(state, good._replace(x=jnp.zeros((H + 1, D), int)))
+        experiment.add_episode(state, good._replace(x=jnp.zeros((H + 1, D), int)))
 
 
 def test_a_policy_that_answers_wrongly_is_named_before_the_plant_moves() -> None:
@@ -485,7 +485,7 @@ def test_a_policy_that_answers_wrongly_is_named_before_the_plant_moves() -> None
 
 
 def test_a_function_is_no_cost() -> None:
-    with pytest.raises(pg.SettingError, match=r"is no Cost; .*Cost\(function\)"):
+    with pytest.raises(pg.ConfigError, match=r"is no Cost; .*Cost\(function\)"):
         pg.compose(CONFIG, TASK, cost=lambda x: x)  # type: ignore[arg-type]
 
 

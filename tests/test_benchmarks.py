@@ -82,7 +82,9 @@ def test_the_products_of_a_step_are_those_of_its_networks(work):
 
 def test_a_workload_is_well_conditioned(work):
     """Objective away from saturation, gradient that float32 can compute: else neither time nor error says much."""
-    value, gradient = jax.jit(jax.value_and_grad(work.objective))(work.state.policy.params, work.belief, work.scenarios)
+    value, gradient = jax.jit(jax.value_and_grad(work.objective))(
+        work.state.policy.params, work.posterior, work.scenarios
+    )
     assert 0.05 < value < 0.95
     assert np.isfinite(jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(gradient)])).all()
     assert set(SIZES) >= {"cart-pole", "double cart-pole"}

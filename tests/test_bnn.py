@@ -67,11 +67,11 @@ def test_the_loss_is_eq_2_over_n(kind, heteroscedastic):
     mean = mean_out + out[:, :3] @ root_out.T
     raw = out[:, 3:] if heteroscedastic else np.zeros((6, 3))
     std = (np.log1p(np.exp(raw)) + 1e-6) * np.diag(root_out)
-    misfit = 0.5 * ((np.asarray(BATCH.y) - mean) / std) ** 2 + np.log(std)
+    nll = 0.5 * ((np.asarray(BATCH.y) - mean) / std) ** 2 + np.log(std)
     penalty = 1.5 * sum(np.sum(layer[k] ** 2) for layer in layers for k in ("kernel", "bias"))
     if kind == "log_normal":
         penalty += log_normal_kl(params["noise"][1])
-    expected = misfit.sum(1).mean() + penalty / size
+    expected = nll.sum(1).mean() + penalty / size
     np.testing.assert_allclose(loss, expected, rtol=1e-2 if kind == "log_normal" else 1e-3)
     assert penalty / size > 0.1 * abs(expected)  # so that a wrong penalty, or N, would show
 
@@ -105,11 +105,11 @@ def test_every_row_of_a_batch_has_noise_of_its_own():
 @pytest.mark.parametrize("kind", ["log_normal", "binary", "none"])
 def test_a_draw_is_one_deterministic_function_and_draws_differ(kind):
     model = network(kind)
-    belief = jax.jit(lambda key, data: model.condition(model.init(key), data))(jax.random.key(0), experience())
-    draws = jax.jit(jax.vmap(model.sample, (0, None)))(jax.random.split(jax.random.key(1), 20), belief)
+    posterior = jax.jit(lambda key, data: model.posterior(model.init(key), data))(jax.random.key(0), experience())
+    draws = jax.jit(jax.vmap(model.sample, (0, None)))(jax.random.split(jax.random.key(1), 20), posterior)
     apply = jax.jit(jax.vmap(model.apply, (None, 0, None, None)))
-    means = [apply(belief, draws, x, u).mean for x, u in zip(BATCH.x[:2], BATCH.u[:2], strict=True)]
-    again = apply(belief, draws, BATCH.x[0], BATCH.u[0]).mean
+    means = [apply(posterior, draws, x, u).mean for x, u in zip(BATCH.x[:2], BATCH.u[:2], strict=True)]
+    again = apply(posterior, draws, BATCH.x[0], BATCH.u[0]).mean
     assert np.array_equal(means[0], again)
     different = len(np.unique(means[0], axis=0))
     assert different == 1 if kind == "none" else different > 3  # a dropped unit may have been silent anyway
@@ -118,10 +118,10 @@ def test_a_draw_is_one_deterministic_function_and_draws_differ(kind):
 
 def test_angles_enter_by_sine_and_cosine():
     model = network()
-    belief = model.condition(jax.jit(model.init)(jax.random.key(0)), experience())
-    draw = model.sample(jax.random.key(1), belief)
+    posterior = model.posterior(jax.jit(model.init)(jax.random.key(0)), experience())
+    draw = model.sample(jax.random.key(1), posterior)
     x, u = BATCH.x[0], BATCH.u[0]
-    here, there = (model.apply(belief, draw, x.at[2].add(turn), u).mean for turn in (0.0, 2 * np.pi))
+    here, there = (model.apply(posterior, draw, x.at[2].add(turn), u).mean for turn in (0.0, 2 * np.pi))
     np.testing.assert_allclose(here, there, atol=1e-5)
 
 
@@ -165,13 +165,13 @@ def learned(std, *, kind="none", head="softplus", heteroscedastic=True, steps=15
         init_key, fit_key, draw_key = jax.random.split(key, 3)
         params = model.init(init_key)
         learner, info = fitted(fit_key, Learner(params, optimizer.init(params)), data)
-        belief = model.condition(learner.params, data)
-        return belief, jax.vmap(model.sample, (0, None))(jax.random.split(draw_key, 100), belief), info
+        posterior = model.posterior(learner.params, data)
+        return posterior, jax.vmap(model.sample, (0, None))(jax.random.split(draw_key, 100), posterior), info
 
-    belief, draws, info = run(jax.random.key(0), data)
+    posterior, draws, info = run(jax.random.key(0), data)
     of_rows = jax.vmap(model.apply, (None, None, 0, 0))
     predict = jax.jit(jax.vmap(of_rows, (None, 0, None, None)))
-    return info, lambda x, u: predict(belief, draws, jnp.asarray(x, jnp.float32), jnp.asarray(u, jnp.float32))
+    return info, lambda x, u: predict(posterior, draws, jnp.asarray(x, jnp.float32), jnp.asarray(u, jnp.float32))
 
 
 def test_it_learns_a_function_and_its_interval_covers():

@@ -20,7 +20,7 @@ from pegasus_jax.builder import (
     set_precision,
     start,
 )
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config, Period
 from pegasus_jax.config_models import DROPOUTS
 from pegasus_jax.learn import data as dataset
@@ -65,7 +65,7 @@ def test_every_variant_has_the_shapes_of_the_loop(model, policy):
     task = cart() if model == "lagrangian" else dial()  # which has no rates
     exp = compose(config_io.parse({"model": model, "policy": policy}), task)
     state = jax.eval_shape(exp.init, jax.random.key(0))
-    state = jax.eval_shape(exp.absorb, state, jax.eval_shape(exp.collect, state))
+    state = jax.eval_shape(exp.add_episode, state, jax.eval_shape(exp.collect, state))
     improved, _ = jax.eval_shape(exp.improve, state)
     assert jax.tree.structure(improved) == jax.tree.structure(state)
     shapes = [[(leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(tree)] for tree in (improved, state)]
@@ -73,7 +73,7 @@ def test_every_variant_has_the_shapes_of_the_loop(model, policy):
 
 
 def test_a_mechanism_needs_coordinates_and_their_rates():
-    with pytest.raises(SettingError, match=r"model=lagrangian needs .*task=dial.*the nearest is model=log_normal"):
+    with pytest.raises(ConfigError, match=r"model=lagrangian needs .*task=dial.*the nearest is model=log_normal"):
         compose(config_io.parse({"model": "lagrangian"}), dial())
 
 
@@ -86,7 +86,7 @@ def test_the_rates_of_a_gym_are_named_and_checked():
         ("[2]", "needs"),
     ):
         wrong = config_io.parse(words | {"rates": rates})
-        with pytest.raises(SettingError, match=expected):
+        with pytest.raises(ConfigError, match=expected):
             compose(wrong, tasks.of_config(wrong))
 
 
@@ -98,10 +98,10 @@ def test_a_policy_counts_in_the_units_it_is_given():
     at = lambda policy, x: policy.apply(params, None, jnp.array(x))  # noqa: E731
     np.testing.assert_allclose(at(counting, [0.3, 1, -2, 2.5]), at(plain, [0.3, 0.5, -0.5, 2.5]), rtol=1e-5)
     with pytest.raises(
-        SettingError, match=r"policy.input_units=\[1.0\] must be 3 numbers, of x \[m\], x' \[m/s\], theta'"
+        ConfigError, match=r"policy.input_units=\[1.0\] must be 3 numbers, of x \[m\], x' \[m/s\], theta'"
     ):
         policy_of(config.MLP(input_units=(1.0,)), task)
-    with pytest.raises(SettingError, match=r"policy.input_units=0 is out of range"):
+    with pytest.raises(ConfigError, match=r"policy.input_units=0 is out of range"):
         config.MLP(input_units=(1.0, 0.0, 1.0))
 
 
@@ -115,8 +115,8 @@ def test_a_policy_counts_in_the_units_it_is_given():
 def test_the_size_of_a_gaussian_process_is_the_authors(words, shape):
     dynamics = compose(config_io.parse(words), cart()).dynamics
     data = jax.eval_shape(lambda: dataset.empty(9, 2, 1))
-    belief = jax.eval_shape(dynamics.condition, jax.eval_shape(dynamics.init, jax.random.key(0)), data)
-    draw = jax.eval_shape(dynamics.sample, jax.random.key(0), belief)
+    posterior = jax.eval_shape(dynamics.posterior, jax.eval_shape(dynamics.init, jax.random.key(0)), data)
+    draw = jax.eval_shape(dynamics.sample, jax.random.key(0), posterior)
     assert shape in [leaf.shape for leaf in jax.tree.leaves(draw)]
 
 
@@ -162,7 +162,7 @@ def test_your_own_model_and_policy_take_the_place_of_the_configured_ones():
 def test_too_few_particles_for_a_covariance_are_refused(search, part):
     """Two particles span a line; matching, or balancing, in the two dimensions of the cart would divide by zero."""
     chosen = dataclasses.replace(tiny(), search=config.Search(**search))
-    with pytest.raises(SettingError, match=part):
+    with pytest.raises(ConfigError, match=part):
         compose(chosen, cart())
 
 
@@ -203,7 +203,7 @@ def test_pilco_improves_a_policy_under_a_model(model, policy, task):
     @jax.jit
     def start(key):
         state = exp.init(key)
-        return exp.absorb(state, exp.collect(state))
+        return exp.add_episode(state, exp.collect(state))
 
     state = start(jax.random.key(0))
     search = jax.jit(exp.search)
@@ -250,7 +250,7 @@ def test_a_gpus_products_have_single_precision_unless_it_was_told(monkeypatch, u
 def test_pilco_without_moments_is_refused(policy, pieces, part):
     """Naming what has them."""
     model = gp(states=2, controls=1, angles=()) if "dynamics" in pieces else None
-    with pytest.raises(SettingError, match=part) as caught:
+    with pytest.raises(ConfigError, match=part) as caught:
         compose(dataclasses.replace(tiny(), policy=policy, search=ANALYTIC), cart(), dynamics=model)
     assert "\n" not in str(caught.value)
 

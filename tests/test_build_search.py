@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 
 from pegasus_jax import config, types
 from pegasus_jax.builder import compose, costs_of, dynamics_of, fit_of, start
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Period
 from pegasus_jax.experiment import SEARCH, trial_key
 from pegasus_jax.imagine import costs as cost
@@ -210,13 +210,13 @@ def test_an_annealing_search_goes_on_where_that_of_the_trial_before_ended():
 
 
 def test_an_annealing_search_has_one_course():
-    with pytest.raises(SettingError, match=r"search.anneal=2 needs search.refine=0"):
+    with pytest.raises(ConfigError, match=r"search.anneal=2 needs search.refine=0"):
         config.Search(anneal=2, refine=0.5)
 
 
 def test_a_cost_without_a_width_cannot_be_widened():
     task = cart(horizon=2)._replace(widened=None)
-    with pytest.raises(SettingError, match=r"search\.widen=4 needs a cost with a width.*the nearest is 1"):
+    with pytest.raises(ConfigError, match=r"search\.widen=4 needs a cost with a width.*the nearest is 1"):
         compose(tiny(), task)
 
 
@@ -251,7 +251,7 @@ def test_a_limit_reaches_the_gradient_as_a_share_of_each_particle():
     ],
 )
 def test_only_what_is_annealed_is_reheated_and_only_a_limit_loosened(search, message):
-    with pytest.raises(SettingError, match=message):
+    with pytest.raises(ConfigError, match=message):
         config.Search(**search)
 
 
@@ -317,7 +317,7 @@ def test_each_factor_of_the_noise_reaches_its_place():
 
 def test_sensors_that_are_not_known_cannot_be_expected():
     task = cart()._replace(sensor_std=np.zeros(2))
-    with pytest.raises(SettingError, match=r"search.sensors=known needs .* task=cart is not; the nearest is"):
+    with pytest.raises(ConfigError, match=r"search.sensors=known needs .* task=cart is not; the nearest is"):
         compose(dataclasses.replace(tiny(), search=config.Search(sensors="known")), task)
 
 
@@ -325,7 +325,7 @@ def test_as_few_particles_as_are_allowed_do():
     assert np.isfinite(first_objective(particles=3, balanced=True))
 
 
-def test_clipping_reaches_the_optimiser():
+def test_clipping_reaches_the_optimizer():
     """Adam's step hides the size of a gradient; its first moment, a tenth of what it was given, does not."""
     moved = {}
     for clip in (None, 1e-6):
@@ -337,7 +337,7 @@ def test_clipping_reaches_the_optimiser():
     np.testing.assert_allclose(moved[1e-6], 0.1 * 1e-6, rtol=1e-3)
 
 
-def test_the_search_minimises_what_objective_says():
+def test_the_search_minimizes_what_objective_says():
     """The first objective of a search is `objective` of the public pieces, put together by hand."""
     exp, state, run = searcher()
     pieces = dict(dynamics=exp.dynamics, policy=exp.policy)

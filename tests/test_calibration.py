@@ -18,8 +18,8 @@ STEPS, STATES = 400, 2
 def uncertain(function_std: float, noise_std: float) -> Dynamics:
     """A model whose change of state is an unknown constant of that spread, seen with that noise."""
     return known(PENDULUM)._replace(
-        sample=lambda key, belief: function_std * jax.random.normal(key, (STATES,)),
-        apply=lambda belief, draw, x, u: Prediction(draw, jnp.full((STATES,), noise_std)),
+        sample=lambda key, posterior: function_std * jax.random.normal(key, (STATES,)),
+        apply=lambda posterior, draw, x, u: Prediction(draw, jnp.full((STATES,), noise_std)),
     )
 
 
@@ -62,12 +62,12 @@ def test_an_angle_that_crosses_the_seam_is_no_error():
 def test_few_draws_say_nearly_the_same():
     """50 draws, each a function along the whole episode, as in a run."""
     model, data = network(), experience(rows=30)
-    belief = jax.jit(lambda: model.condition(model.init(jax.random.key(1)), data))()
+    posterior = jax.jit(lambda: model.posterior(model.init(jax.random.key(1)), data))()
     trajectory = Trajectory(jnp.concatenate([data.x[:30], data.x[29:30] + data.y[29:30]]), data.u[:30], jnp.zeros(30))
 
     @partial(jax.jit, static_argnums=1)
     def ask(key, draws):
-        return calibration(key, belief, trajectory, dynamics=model, angles=(2,), draws=draws)
+        return calibration(key, posterior, trajectory, dynamics=model, angles=(2,), draws=draws)
 
     assert float(ask(jax.random.key(0), 50)) == pytest.approx(float(ask(jax.random.key(1), 2000)), rel=0.2)
 
@@ -78,9 +78,9 @@ def test_of_an_experiment_it_is_unknown_before_there_are_data_and_changes_nothin
         tiny(fit__steps=5, search__steps=2), task, dynamics=regression(2, 1), policy=noisy_linear_policy(task)
     )
     state = exp.init(jax.random.key(0))
-    collect, absorb, calibrate = (jax.jit(f) for f in (exp.collect, exp.absorb, exp.calibrate))
+    collect, add_episode, calibrate = (jax.jit(f) for f in (exp.collect, exp.add_episode, exp.calibrate))
     assert np.isnan(calibrate(state, collect(state)))
-    after = absorb(state, collect(state))
+    after = add_episode(state, collect(state))
     flown = collect(after)
     assert np.isfinite(calibrate(after, flown))
     assert same(flown, collect(after))

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import pytest
 
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import check
 from pegasus_jax.tasks.cost_check import Facts
@@ -142,7 +142,7 @@ def test_angles_of_more_than_two_turns_are_degrees() -> None:
     assert check.plausible(at(-6.0), facts(3.14)) == []
     assert "more than a turn" in check.plausible(at(-7.0), facts(3.14))[0]
     for reading, start in ((90.0, 0.0), (0.0, -180.0)):
-        with pytest.raises(SettingError, match=r"degrees\? Return np.deg2rad"):
+        with pytest.raises(ConfigError, match=r"degrees\? Return np.deg2rad"):
             check.plausible(at(reading), facts(start))
 
 
@@ -175,5 +175,5 @@ def test_readings_that_follow_from_others_are_named() -> None:
 )
 def test_where_episodes_end_is_looked_at_before_they_begin(stop: Any, says: str | None) -> None:
     task, config = cart()._replace(stop=stop), Config(task="gym", stop="robot:fallen")
-    with pytest.raises(SettingError, match=says) if says else nullcontext():
+    with pytest.raises(ConfigError, match=says) if says else nullcontext():
         check.stopping(config, task)

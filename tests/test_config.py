@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.checks import ConfigError, nearest
 from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
 from pegasus_jax.config_models import DROPOUTS
 
@@ -98,7 +98,7 @@ IMPOSSIBLE = [
 
 @pytest.mark.parametrize(("kind", "fields", "part"), IMPOSSIBLE)
 def test_an_impossible_value_is_named_in_one_line(kind, fields, part):
-    with pytest.raises(SettingError) as caught:
+    with pytest.raises(ConfigError) as caught:
         kind(**fields)
     message = str(caught.value)
     assert part in message

@@ -107,7 +107,7 @@ def test_the_expected_cost_against_samples(name, x64):
 
 @pytest.mark.parametrize("size", [1, 4, 13])
 def test_nodes_have_the_moments_of_a_standard_normal(size):
-    """The first two exactly; the next two nearly: a standardised sample of as many is off by .11 and .21 (std)."""
+    """The first two exactly; the next two nearly: a standardized sample of as many is off by .11 and .21 (std)."""
     z = cost.normal_nodes(512, size)
     np.testing.assert_allclose(z.mean(0), 0, atol=1e-12)
     np.testing.assert_allclose(z.T @ z / 512, np.eye(size), atol=1e-12)

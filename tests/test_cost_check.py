@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.tasks import cost_check, user_code
 
 COSTS = """
@@ -97,7 +97,7 @@ def facts(mean=(np.pi, 0.0), std=(0.05, 0.05), angles=(0,), limit=np.inf):
 
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_cannot_be_learned_from_is_one_line(costs, name):
-    with pytest.raises(SettingError) as caught:
+    with pytest.raises(ConfigError) as caught:
         cost_check.notes(costs(name), facts(), f"cost=costs:{name}")
     message = str(caught.value)
     assert REFUSED[name] in message

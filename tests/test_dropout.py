@@ -198,7 +198,7 @@ def test_log_normal_float32_agrees_with_float64(name):
         np.testing.assert_allclose(np.asarray(single), np.asarray(double), rtol=3e-4)
 
 
-# The log-uniform prior: KL(N(1, alpha) || log-uniform), normalised to vanish as alpha -> infinity
+# The log-uniform prior: KL(N(1, alpha) || log-uniform), normalized to vanish as alpha -> infinity
 
 
 def log_uniform_kl(alpha):

@@ -35,16 +35,16 @@ def part(tree, index):
 def test_a_particle_follows_one_member(pair):
     member, many, params = pair
     data = rows()
-    belief = many.condition(params, data)
+    posterior = many.posterior(params, data)
     x, u = jnp.array([0.3, -0.2]), jnp.array([0.5])
     alone = []
     for index in range(MEMBERS):
-        own = member.condition(part(params, index), data)
+        own = member.posterior(part(params, index), data)
         alone.append(member.apply(own, member.sample(jax.random.key(9), own), x, u).mean)
     followed = set()
     for seed in range(12):
-        draw = many.sample(jax.random.key(seed), belief)
-        predicted = many.apply(belief, draw, x, u)
+        draw = many.sample(jax.random.key(seed), posterior)
+        predicted = many.apply(posterior, draw, x, u)
         distance = np.abs(np.asarray(alone) - np.asarray(predicted.mean)).max(axis=1)
         followed.add(int(distance.argmin()))
         assert distance.min() < 1e-6
@@ -54,8 +54,8 @@ def test_a_particle_follows_one_member(pair):
 
 def test_members_are_followed_equally_often(pair):
     _, many, params = pair
-    belief = many.condition(params, rows())
-    chosen, _ = jax.vmap(many.sample, (0, None))(jax.random.split(jax.random.key(1), 3000), belief)
+    posterior = many.posterior(params, rows())
+    chosen, _ = jax.vmap(many.sample, (0, None))(jax.random.split(jax.random.key(1), 3000), posterior)
     np.testing.assert_allclose(chosen.mean(0), 1 / MEMBERS, atol=4 * np.sqrt(2 / 9 / 3000))
 
 
@@ -63,37 +63,37 @@ def test_members_are_followed_equally_often(pair):
 def test_particles_together_are_what_each_would_be_alone(pair, particles):
     """Dealt in turn, they need no other member's arithmetic; drawn one by one, they are not mistaken for dealt ones."""
     _, many, params = pair
-    belief = many.condition(params, rows())
+    posterior = many.posterior(params, rows())
     keys = lambda: jax.random.split(jax.random.key(1), particles)  # noqa: E731
     x, u = (jax.random.normal(jax.random.key(i), (particles, width)) for i, width in enumerate((2, 1)))
     each = jax.vmap(many.apply, (None, 0, 0, 0))
     together = many.particles(many.apply)
-    dealt, drawn = many.deal(keys(), belief), jax.vmap(many.sample, (0, None))(keys(), belief)
+    dealt, drawn = many.deal(keys(), posterior), jax.vmap(many.sample, (0, None))(keys(), posterior)
     assert np.argmax(dealt.chosen, 1).tolist() == [k % MEMBERS for k in range(particles)]
     for draws in (dealt, drawn):
-        for one, other in zip(together(belief, draws, x, u), each(belief, draws, x, u), strict=True):
+        for one, other in zip(together(posterior, draws, x, u), each(posterior, draws, x, u), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
-    still = many.particles(lambda belief, draw, x, u: Prediction(0 * x, 0 * x))
-    assert not np.any(still(belief, dealt, x, u).mean)
+    still = many.particles(lambda posterior, draw, x, u: Prediction(0 * x, 0 * x))
+    assert not np.any(still(posterior, dealt, x, u).mean)
 
 
 def test_a_dealt_particles_draw_is_of_its_member():
     """Where noise is learned, the k-th particle's is that of member k modulo their number, drawn by its own key."""
     member = dynamics_of(BNN(hidden=(8,), dropout="log_normal"), cart())
     many = ensemble(member, MEMBERS)
-    belief = many.condition(many.init(jax.random.key(0)), rows())
-    dealt = many.deal(jax.random.split(jax.random.key(1), 7), belief)
+    posterior = many.posterior(many.init(jax.random.key(0)), rows())
+    dealt = many.deal(jax.random.split(jax.random.key(1), 7), posterior)
     for k, key in enumerate(jax.random.split(jax.random.key(1), 7)):
-        alone = member.sample(key, part(belief, k % MEMBERS))
+        alone = member.sample(key, part(posterior, k % MEMBERS))
         for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(part(dealt.own, k)), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
 def test_as_many_imagined_particles_follow_each_member(pair):
     _, many, params = pair
-    belief = many.condition(params, rows())
+    posterior = many.posterior(params, rows())
     task, policy = cart(), policy_of(MLP(), cart())
-    drawn = draw(jax.random.key(0), 0, belief, blocks=blocks_of(13, task, many, policy), period=Period())
+    drawn = draw(jax.random.key(0), 0, posterior, blocks=blocks_of(13, task, many, policy), period=Period())
     assert drawn.dynamics.chosen.sum(0).tolist() == [5, 4, 4]
 
 

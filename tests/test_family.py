@@ -83,12 +83,12 @@ def episodes(trial):
 def fitted(model):
     """A model's fit, compiled once for all policies: (state, episodes) -> state and report."""
     exp, _ = composed(model, "mlp", "matched")
-    return unchecked(jax.jit(jax.vmap(lambda state, episode: exp.fit(exp.absorb(state, episode)))))
+    return unchecked(jax.jit(jax.vmap(lambda state, episode: exp.fit(exp.add_episode(state, episode)))))
 
 
 @cache
 def begun(model, policy, analytic):
-    """The first state of two seeds, drawn once for matched and kept, whose searches have the same optimiser."""
+    """The first state of two seeds, drawn once for matched and kept, whose searches have the same optimizer."""
     exp, _ = composed(model, policy, "analytic" if analytic else "matched")
     return jax.jit(jax.vmap(exp.init))(jax.vmap(jax.random.key)(jnp.arange(SEEDS)))
 

@@ -10,7 +10,7 @@ import pytest
 from benchmarks import results_page
 from benchmarks.study import RESULTS
 from pegasus_jax.builder import build
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import BNN, RBF, SSGP, Analytic, Config
 from pegasus_jax.studies import claims, comparison
 from pegasus_jax.studies.figures import Claim, Figure, read
@@ -123,7 +123,7 @@ def test_claims_cite_variants_and_trials_that_there_are(name):
 )
 def test_a_file_that_is_wrong_is_refused_in_one_line(old, new, message, tmp_path):
     assert old in TINY
-    with pytest.raises(SettingError) as refusal:
+    with pytest.raises(ConfigError) as refusal:
         comparison.configs(figure_of(tmp_path, TINY.replace(old, new)))
     assert message in str(refusal.value)
     assert "\n" not in str(refusal.value)
@@ -148,7 +148,7 @@ def test_a_wrong_command_ends_in_one_line(words, message, tmp_path):
 
 
 def test_an_environment_that_is_one_object_is_refused():
-    with pytest.raises(SettingError, match="task=gym"):
+    with pytest.raises(ConfigError, match="task=gym"):
         study(Config(task="gym"), [0])
 
 
@@ -314,5 +314,5 @@ def test_unknown_numbers_are_null_and_seeds_are_lists_or_ranges():
     assert seed_list("5,2") == [5, 2]
     assert seed_list("7") == [7]
     for text in ("9-3", "one", "", "-1", "0-99999999999999999999"):
-        with pytest.raises(SettingError, match="names no seeds"):
+        with pytest.raises(ConfigError, match="names no seeds"):
             seed_list(text)

@@ -1,4 +1,4 @@
-"""Model fitting: it minimises, it reads only rows in use, and a bad gradient never poisons it."""
+"""Model fitting: it minimizes, it reads only rows in use, and a bad gradient never poisons it."""
 
 from functools import partial
 

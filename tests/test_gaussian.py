@@ -156,7 +156,7 @@ def test_moments_against_samples(name):
     image = compiled(name)(MEAN, COV)
     deviation = standard_normals(D) @ np.linalg.cholesky(COV).T
     y, variance = MAPS[name][1](MEAN + deviation)
-    centred = y - y.mean(0)
+    centered = y - y.mean(0)
     variance = np.broadcast_to(variance, y.shape)
 
     def agree(value, samples, what):
@@ -165,10 +165,10 @@ def test_moments_against_samples(name):
 
     agree(image.mean, y, "mean")
     for i in range(y.shape[1]):
-        products = centred[:, i, None] * centred
+        products = centered[:, i, None] * centered
         products[:, i] += variance[:, i]
         agree(image.cov[i], products, f"covariance, row {i}")
-        agree((COV @ image.slope)[:, i], deviation * centred[:, i, None], f"input-output covariance, column {i}")
+        agree((COV @ image.slope)[:, i], deviation * centered[:, i, None], f"input-output covariance, column {i}")
 
 
 @every_map

@@ -67,15 +67,15 @@ def test_predictions_and_evidence_are_scikit_learns(x64):
 
     _, _, (mean_in, std_in), (mean_out, std_out) = scaled(data)
     points = mean_in + std_in * np.random.default_rng(1).normal(size=(20, 6))
-    belief = jax.jit(model.condition)(params, data)
-    images = jax.jit(jax.vmap(model.moments, (None, 0, None)))(belief, jnp.asarray(points), jnp.zeros((6, 6)))
+    posterior = jax.jit(model.posterior)(params, data)
+    images = jax.jit(jax.vmap(model.moments, (None, 0, None)))(posterior, jnp.asarray(points), jnp.zeros((6, 6)))
     for e, r in enumerate(regressors):
         mean, std = r.predict((points - mean_in) / std_in, return_std=True)
         noise = np.exp(params["log_noise"][e])
         np.testing.assert_allclose(images.mean[:, e], mean_out[e] + std_out[e] * mean, atol=1e-9)
         np.testing.assert_allclose(images.cov[:, e, e], std_out[e] ** 2 * (std**2 - noise**2), rtol=1e-8)
-    draw = jax.jit(model.sample)(jax.random.key(0), belief)
-    std = jax.jit(model.apply)(belief, draw, data.x[0], data.u[0]).std
+    draw = jax.jit(model.sample)(jax.random.key(0), posterior)
+    std = jax.jit(model.apply)(posterior, draw, data.x[0], data.u[0]).std
     np.testing.assert_allclose(std, std_out * np.exp(params["log_noise"]), rtol=1e-9)
 
 
@@ -83,13 +83,13 @@ def test_draws_have_the_posterior_mean_and_covariance_whatever_the_number_of_fea
     """A draw is one function: its values at several points hang together as the posterior's do."""
     data, model = experience(), gp(**SHAPES, features=10)
     params = parameters(model)
-    belief = jax.jit(model.condition)(params, data)
+    posterior = jax.jit(model.posterior)(params, data)
     count, points = 20_000, 5
     noise = np.random.default_rng(2)
     x = np.asarray(data.x)[3] + 0.3 * noise.normal(size=(points, 3)).astype(np.float32)
     u = np.asarray(data.u)[:1].repeat(points, 0)
-    draws = jax.jit(jax.vmap(model.sample, (0, None)))(jax.random.split(jax.random.key(1), count), belief)
-    values = jax.jit(jax.vmap(jax.vmap(model.apply, (None, None, 0, 0)), (None, 0, None, None)))(belief, draws, x, u)
+    draws = jax.jit(jax.vmap(model.sample, (0, None)))(jax.random.split(jax.random.key(1), count), posterior)
+    values = jax.jit(jax.vmap(jax.vmap(model.apply, (None, None, 0, 0)), (None, 0, None, None)))(posterior, draws, x, u)
     inputs = np.concatenate([x[:, :2], np.sin(x[:, 2:]), np.cos(x[:, 2:]), u], 1)
     _, _, (mean_in, std_in), (mean_out, std_out) = scaled(data)
     for e, r in enumerate(reference(params, data)):
@@ -137,10 +137,10 @@ def test_rows_not_in_use_do_not_count(kind):
 
     @jax.jit
     def everything(params, data):
-        rows, belief = model.prepare(data), model.condition(params, data)
-        draw = model.sample(jax.random.key(0), belief)
-        ahead = model.apply(belief, draw, jnp.ones(3), jnp.ones(2))
-        image = model.moments(belief, jnp.ones(6), 0.1 * jnp.eye(6))
+        rows, posterior = model.prepare(data), model.posterior(params, data)
+        draw = model.sample(jax.random.key(0), posterior)
+        ahead = model.apply(posterior, draw, jnp.ones(3), jnp.ones(2))
+        image = model.moments(posterior, jnp.ones(6), 0.1 * jnp.eye(6))
         return jax.value_and_grad(model.loss)(params, None, None, rows), ahead, image
 
     params = parameters(model)
@@ -168,9 +168,9 @@ def test_analytic_moments_are_those_of_the_draws(kind):
     x, u = noise.normal(size=(25, 2)), noise.normal(size=(25, 1))
     y = np.stack([np.sin(x[:, 0] + u[:, 0]), x[:, 0] * x[:, 1]], 1)
     data = Dataset(*(jnp.asarray(rows, float) for rows in (x, u, y)), jnp.int32(25))
-    belief = jax.jit(model.condition)(parameters(model), data)
+    posterior = jax.jit(model.posterior)(parameters(model), data)
     mean, root = np.array([0.3, -0.2, 0.5]), np.array([[0.5, 0, 0], [0.3, 0.4, 0], [-0.2, 0.1, 0.6]])
-    image = jax.jit(model.moments)(belief, jnp.asarray(mean), jnp.asarray(root @ root.T))
+    image = jax.jit(model.moments)(posterior, jnp.asarray(mean), jnp.asarray(root @ root.T))
 
     count, chunk = 100_000, 2000
     inputs = mean + noise.normal(size=(count, 3)) @ root.T
@@ -178,7 +178,7 @@ def test_analytic_moments_are_those_of_the_draws(kind):
     @jax.jit
     def outputs(rows):
         def one(key, row):
-            return model.apply(belief, model.sample(key, belief), row[:2], row[2:]).mean
+            return model.apply(posterior, model.sample(key, posterior), row[:2], row[2:]).mean
 
         keys = jax.random.split(jax.random.key(5), count).reshape(-1, chunk)
         return jax.lax.map(lambda both: jax.vmap(one)(*both), (keys, rows.reshape(-1, chunk, 3)))
@@ -225,11 +225,11 @@ def test_a_fit_finds_a_known_function_and_its_noise(kind):
     learners, info = jax.vmap(run, (0, None))(jax.random.split(jax.random.key(0), 3), noisy_curve())
     assert np.all(info.loss < info.first - 0.1)
     assert np.all(info.skipped == 0)
-    belief = jax.jit(jax.vmap(model.condition, (0, None)))(learners.params, noisy_curve())
+    posterior = jax.jit(jax.vmap(model.posterior, (0, None)))(learners.params, noisy_curve())
     x = np.linspace(-1.8, 1.8, 30)[:, None]
     u = np.linspace(0.9, -0.9, 30)[:, None]
     for i in range(3):
-        b = jax.tree.map(lambda leaf, i=i: leaf[i], belief)
+        b = jax.tree.map(lambda leaf, i=i: leaf[i], posterior)
         draws = jax.jit(jax.vmap(model.sample, (0, None)))(jax.random.split(jax.random.key(9), 200), b)
         ahead = jax.jit(jax.vmap(jax.vmap(model.apply, (None, None, 0, 0)), (None, 0, None, None)))(b, draws, x, u)
         error = np.asarray(ahead.mean).mean(0) - curve(x, u)
@@ -263,10 +263,10 @@ def test_no_data_make_nan(kind):
         traces += 1
         learner = Learner(model.init(jax.random.key(0)), fitter.init(None))
         learner, info = fitter.run(jax.random.key(1), learner, data, 30)
-        belief = model.condition(learner.params, data)
-        draw = model.sample(jax.random.key(2), belief)
-        moved = jax.value_and_grad(lambda x: jnp.sum(model.apply(belief, draw, x, data.u[1])[0]))(data.x[1] + 0.1)
-        image = model.moments(belief, jnp.ones(6), 0.1 * jnp.eye(6))
+        posterior = model.posterior(learner.params, data)
+        draw = model.sample(jax.random.key(2), posterior)
+        moved = jax.value_and_grad(lambda x: jnp.sum(model.apply(posterior, draw, x, data.u[1])[0]))(data.x[1] + 0.1)
+        image = model.moments(posterior, jnp.ones(6), 0.1 * jnp.eye(6))
         return learner.params, info, moved, image
 
     for name in ("plain", "constant columns", "repeated rows", "no noise", "one row", "no rows"):

@@ -281,7 +281,7 @@ def test_what_did_not_take_place_costs_what_the_user_says() -> None:
     np.testing.assert_allclose(ran.trajectory.cost, [1.0, 4.0, 9.0])  # of the states 1, 2 and 3
     whole = exp.episode(jax.random.key(0), exp.init(jax.random.key(1)).policy.params, True)
     assert (whole.x.shape, whole.u.shape, int(whole.length)) == ((7, 1), (6, 1), 3)
-    state = jax.jit(exp.absorb)(exp.init(jax.random.key(1)), whole)
+    state = jax.jit(exp.add_episode)(exp.init(jax.random.key(1)), whole)
     assert int(state.data.size) == 3
     np.testing.assert_array_equal(state.data.x[:, 0], [0, 1, 2, *[0] * (len(state.data.x) - 3)])
 

@@ -12,7 +12,7 @@ from scipy.integrate import solve_ivp
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import fit
 from pegasus_jax.models import dropout
-from pegasus_jax.models.lagrangian import LEAST_MASS, Belief, Units, lagrangian, solve
+from pegasus_jax.models.lagrangian import LEAST_MASS, Posterior, Units, lagrangian, solve
 from pegasus_jax.types import Learner, Trajectory
 
 SPEEDS = (2, 1)  # x is (cart, pole's speed, cart's speed, pole)
@@ -83,29 +83,29 @@ def fitted(data):
     learn = partial(fit, prepare=model.prepare, loss=model.loss, optimizer=optimizer, steps=1500, batch=50)
     learner, info = jax.jit(learn)(jax.random.key(2), Learner(params, optimizer.init(params)), known)
     assert int(info.skipped) == 0
-    return model, model.condition(learner.params, known)
+    return model, model.posterior(learner.params, known)
 
 
-def predictions(model, belief, x, u, draws=20):
+def predictions(model, posterior, x, u, draws=20):
     """Changes [draws, N, D]."""
     keys = jax.random.split(jax.random.key(3), draws)
-    one = lambda key: jax.vmap(partial(model.apply, belief, model.sample(key, belief)))(x, u).mean  # noqa: E731
+    one = lambda key: jax.vmap(partial(model.apply, posterior, model.sample(key, posterior)))(x, u).mean  # noqa: E731
     return jax.jit(jax.vmap(one))(keys)
 
 
 def test_it_learns_a_mechanism_from_six_episodes(fitted, data):
     """The next two to 5 % of what changes, at the median; a network of changes is at 10 to 30 % then."""
-    model, belief = fitted
+    model, posterior = fitted
     x, u, y = data.x[150:], data.u[150:], data.y[150:]
-    error = jnp.abs(predictions(model, belief, x, u).mean(0) - y)
+    error = jnp.abs(predictions(model, posterior, x, u).mean(0) - y)
     assert np.all(np.median(error, 0) < 0.05 * np.std(y, 0))
 
 
 def test_draws_differ_and_share_the_kinematics(fitted, data):
     """Particles disagree about forces; all of them move a coordinate by about what its speed says."""
-    model, belief = fitted
+    model, posterior = fitted
     x, u = data.x[:20], data.u[:20]
-    drawn = predictions(model, belief, x, u)
+    drawn = predictions(model, posterior, x, u)
     assert np.all(np.asarray(drawn[:, :, SPEEDS].std(0)) > 0)
     between = 0.1 * (x[:, SPEEDS] + drawn[..., SPEEDS] / 2)  # exact for constant accelerations
     np.testing.assert_allclose(drawn[..., (0, 3)], between, atol=0.1)
@@ -113,18 +113,18 @@ def test_draws_differ_and_share_the_kinematics(fitted, data):
 
 @pytest.fixture(scope="module")
 def made_up():
-    """A mechanism of random numbers in units that are not one, in float64: the pieces of its belief."""
+    """A mechanism of random numbers in units that are not one, in float64: the pieces of its posterior."""
     with jax.enable_x64(True):
         params = mechanism().init(jax.random.key(0))
         noise = np.random.default_rng(0)
         params |= {"resistance": jnp.asarray(noise.normal(size=(2, 2))), "constant": jnp.array([0.3, -0.2])}
         units = Units(*map(jnp.asarray, ([0.4, 0.0], [0.7, 1.0], [1.5, 6.0], [3.0], np.ones(4), 1)))
-    return Belief(params, units)
+    return Posterior(params, units)
 
 
-def energies(belief, q):
+def energies(posterior, q):
     """M [2, 2] and V [] at q, in float64."""
-    layers = jax.tree.map(np.asarray, belief.params["network"]["params"])
+    layers = jax.tree.map(np.asarray, posterior.params["network"]["params"])
     features = np.array([(q[0] - 0.4) / 0.7, np.sin(q[1]), np.cos(q[1])])
     hidden = features @ layers["layer_0"]["kernel"] + layers["layer_0"]["bias"]
     out = hidden / (1 + np.exp(-hidden)) @ layers["layer_1"]["kernel"] + layers["layer_1"]["bias"]
@@ -133,11 +133,11 @@ def energies(belief, q):
     return lower @ lower.T, out[3]
 
 
-def followed(belief, x, u, periods=1, **changes):
+def followed(posterior, x, u, periods=1, **changes):
     """x after so many periods of the model's, in steps so small that they are all but exact."""
     with jax.enable_x64(True):
         model = mechanism(substeps=10, **changes)
-        step = jax.jit(lambda x: x + model.apply(belief, [None, jnp.ones(8)], x, jnp.asarray(u)).mean)
+        step = jax.jit(lambda x: x + model.apply(posterior, [None, jnp.ones(8)], x, jnp.asarray(u)).mean)
         for _ in range(periods):
             x = step(jnp.asarray(x))
     return np.asarray(x)
@@ -170,25 +170,25 @@ def test_a_period_is_one_of_lagranges_equations(made_up):
 def test_without_forces_energy_stays(made_up, monkeypatch):
     monkeypatch.setattr("pegasus_jax.models.lagrangian.GREATEST_SPEED", 1e3)  # the limit takes a little, else
     calm = {name: np.zeros_like(made_up.params[name]) for name in ("control", "constant", "resistance")}
-    belief = made_up._replace(params=made_up.params | calm)
+    posterior = made_up._replace(params=made_up.params | calm)
 
     def energy(x):
-        mass, potential = energies(belief, x[[0, 3]])
+        mass, potential = energies(posterior, x[[0, 3]])
         v = x[[2, 1]] / np.array([1.5, 6.0])
         return v @ mass @ v / 2 + potential
 
     start = np.array([0.3, 4.0, -1.2, 0.8])
-    end = followed(belief, start, np.zeros(1), periods=4)
+    end = followed(posterior, start, np.zeros(1), periods=4)
     assert np.abs(end - start).max() > 0.5  # it went somewhere
     assert abs(energy(end) - energy(start)) < 1e-5 * abs(energy(start))
 
 
 def test_a_speed_without_bounds_stays_finite(made_up):
     """Far from any data a rollout may be wrong, never infinite, and its gradient neither."""
-    model, belief = mechanism(), jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), made_up)
+    model, posterior = mechanism(), jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), made_up)
 
     def far(x):
-        step = lambda x, _: (x + model.apply(belief, [None, jnp.ones(8)], x, jnp.array([10.0])).mean, None)  # noqa: E731
+        step = lambda x, _: (x + model.apply(posterior, [None, jnp.ones(8)], x, jnp.array([10.0])).mean, None)  # noqa: E731
         return jax.lax.scan(step, x, None, length=30)[0]
 
     end, slope = jax.jit(lambda x: (far(x), jax.jacfwd(far)(x)))(jnp.array([50.0, 300.0, -80.0, 1.0]))

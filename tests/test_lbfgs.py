@@ -1,4 +1,4 @@
-"""Full-data fitting by L-BFGS: it minimises, the value never rises, and what is not finite is not taken."""
+"""Full-data fitting by L-BFGS: it minimizes, the value never rises, and what is not finite is not taken."""
 
 import jax
 import jax.numpy as jnp
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from pegasus_jax.pilco.lbfgs import full_data, minimise
+from pegasus_jax.pilco.lbfgs import full_data, minimize
 from pegasus_jax.types import Dataset, Learner
 from probes import regression, same
 
@@ -17,7 +17,7 @@ def rosenbrock(x):
 
 def test_it_finds_the_minimum_that_scipy_finds(x64):
     start = np.array([-1.2, 1.0, 0.5])
-    found = jax.jit(lambda x: minimise(rosenbrock, x, 200))(start)
+    found = jax.jit(lambda x: minimize(rosenbrock, x, 200))(start)
     theirs = optimize.minimize(
         rosenbrock, start, jac=jax.grad(rosenbrock), method="L-BFGS-B", options={"ftol": 1e-15, "gtol": 1e-10}
     )
@@ -29,7 +29,7 @@ def test_it_finds_the_minimum_that_scipy_finds(x64):
 
 def test_the_value_falls_with_every_step_allowed():
     start = jnp.array([-1.2, 1.0, 0.5, 2.0, -1.0])
-    run = jax.jit(lambda steps: minimise(rosenbrock, start, steps))
+    run = jax.jit(lambda steps: minimize(rosenbrock, start, steps))
     found = [run(n) for n in (1, 2, 5, 10, 20)]
     values = [float(f.value) for f in found]
     assert values == sorted(values, reverse=True)
@@ -42,7 +42,7 @@ def test_the_value_falls_with_every_step_allowed():
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_a_region_where_the_function_is_not_finite_is_not_entered(bad):
     """The minimum on the way to it is found all the same."""
-    run = jax.jit(lambda x: minimise(lambda x: jnp.where(x > 3, bad, (x - 2.9) ** 4 - x), x, 100))
+    run = jax.jit(lambda x: minimize(lambda x: jnp.where(x > 3, bad, (x - 2.9) ** 4 - x), x, 100))
     found = run(jnp.float32(-4.0))
     assert jnp.isfinite(found.value)
     assert found.params <= 3
@@ -50,7 +50,7 @@ def test_a_region_where_the_function_is_not_finite_is_not_entered(bad):
 
 
 def test_where_nothing_is_finite_nothing_changes():
-    found = jax.jit(lambda x: minimise(lambda x: jnp.sum(x) * jnp.nan, x, 50))(jnp.ones(3))
+    found = jax.jit(lambda x: minimize(lambda x: jnp.sum(x) * jnp.nan, x, 50))(jnp.ones(3))
     assert same(found.params, jnp.ones(3))
     assert found.skipped == found.steps == 2
 

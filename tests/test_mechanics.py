@@ -21,15 +21,15 @@ K = 21  # no whole number of blocks
 
 
 def pieces(case: dict, noise: dropout.Dropout, substeps: int) -> tuple:
-    """(plain, fused, belief, masks, x, u) of random data in single precision."""
+    """(plain, fused, posterior, masks, x, u) of random data in single precision."""
     model = lagrangian(**case, dropout=noise, dt=0.1, substeps=substeps)
     d, c = case["states"], case["controls"]
     random = np.random.default_rng(0)
     x, u, y = (jnp.asarray(random.normal(size=(50, n)), jnp.float32) for n in (d, c, d))
     params = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), model.init(jax.random.key(1)))
     params["constant"], params["resistance"] = (jnp.full_like(params[name], 0.3) for name in ("constant", "resistance"))
-    belief = model.condition(params, Dataset(3.0 * x, u, y, jnp.int32(50)))
-    masks = jax.vmap(lambda key: model.sample(key, belief))(jax.random.split(jax.random.key(2), K))
+    posterior = model.posterior(params, Dataset(3.0 * x, u, y, jnp.int32(50)))
+    masks = jax.vmap(lambda key: model.sample(key, posterior))(jax.random.split(jax.random.key(2), K))
     masks = jax.tree.map(lambda leaf: leaf.astype(jnp.float32), masks)
     each = jax.vmap(model.apply, (None, 0, 0, 0))
     order = np.array([*(i for i in range(d) if i not in case["rates"]), *case["rates"]])
@@ -41,7 +41,7 @@ def pieces(case: dict, noise: dropout.Dropout, substeps: int) -> tuple:
 
     mechanics = dict(turning=turning, dt=0.1, substeps=substeps, activation=case["activation"])
     fused = {on: kernel.fused(plain, order, **mechanics, interpret=on) for on in (True, False)}
-    return plain, fused, belief, masks, 2.0 * x[:K], u[:K]
+    return plain, fused, posterior, masks, 2.0 * x[:K], u[:K]
 
 
 CASES = [
@@ -56,7 +56,7 @@ def test_as_the_plain_form(case: dict, noise: dropout.Dropout, substeps: int) ->
     plain, fused, *arguments = pieces(case, noise, substeps)
     weight = jax.random.normal(jax.random.key(3), (K, case["states"]))
 
-    by = (0, 1, 2, 3) if case is RELU else (2, 3)  # by belief and masks it is the plain form's: once is enough
+    by = (0, 1, 2, 3) if case is RELU else (2, 3)  # by posterior and masks it is the plain form's: once is enough
 
     def both(change: Callable) -> tuple:
         value = lambda *given: jnp.sum(weight * change(*given))  # noqa: E731
@@ -71,10 +71,10 @@ def test_as_the_plain_form(case: dict, noise: dropout.Dropout, substeps: int) ->
 
 
 def test_a_model_takes_it_where_there_is_one_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    _, _, belief, masks, x, u = pieces(RELU, dropout.none(), 1)
+    _, _, posterior, masks, x, u = pieces(RELU, dropout.none(), 1)
     model = lagrangian(**RELU, dropout=dropout.none(), dt=0.1, substeps=1)
     assert model.particles is not None
-    expected, calls = jax.vmap(model.apply, (None, 0, 0, 0))(belief, masks, x, u), []
+    expected, calls = jax.vmap(model.apply, (None, 0, 0, 0))(posterior, masks, x, u), []
 
     def fused(*arguments: object, **mechanics: object) -> object:
         calls.append(mechanics)
@@ -84,23 +84,23 @@ def test_a_model_takes_it_where_there_is_one_gpu(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(kernel, "fused", fused)
     for there in (False, True):
         monkeypatch.setattr("pegasus_jax.models.lagrangian.alone_on_gpu", lambda x, there=there: there)
-        got = model.particles(model.apply)(belief, masks, x, u)
+        got = model.particles(model.apply)(posterior, masks, x, u)
         np.testing.assert_allclose(got.mean, expected.mean, rtol=2e-5, atol=2e-5)
         np.testing.assert_allclose(got.std, expected.std, rtol=1e-6)
         assert len(calls) == there
-    own = model.particles(lambda belief, masks, x, u: u)  # a model that somebody changed
-    np.testing.assert_array_equal(own(belief, masks, x, u), u)
+    own = model.particles(lambda posterior, masks, x, u: u)  # a model that somebody changed
+    np.testing.assert_array_equal(own(posterior, masks, x, u), u)
 
 
 @pytest.mark.parametrize(("case", "noise", "substeps"), CASES)
 def test_compiles_for_a_gpu_that_is_not_there(case: dict, noise: dropout.Dropout, substeps: int) -> None:
     """Down to the kernel compiler's own language, with seeds and policies as further axes."""
-    _, fused, belief, masks, x, u = pieces(case, noise, substeps)
+    _, fused, posterior, masks, x, u = pieces(case, noise, substeps)
 
-    def slope(belief: object, masks: object, x: Array) -> Array:
-        return jax.grad(lambda x: jnp.sum(fused[False](belief, masks, x, u)))(x)
+    def slope(posterior: object, masks: object, x: Array) -> Array:
+        return jax.grad(lambda x: jnp.sum(fused[False](posterior, masks, x, u)))(x)
 
-    seeds = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), (belief, masks, jnp.stack([x] * 3)))
+    seeds = jax.tree.map(lambda leaf: jnp.stack([leaf] * 2), (posterior, masks, jnp.stack([x] * 3)))
     policies = jax.vmap(slope, (None, None, 0))
     there = AbstractMesh((), (), abstract_device=AbstractDevice("NVIDIA H200", num_cores=None, platform="cuda"))
     with use_abstract_mesh(there):

@@ -16,7 +16,7 @@ import pytest
 from pegasus_envs import mjcf_check, mjcf_plant
 from pegasus_envs.render import frames
 from pegasus_jax import tasks
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config, label
 from pegasus_jax.runs import config_io, store
 
@@ -155,7 +155,7 @@ def test_folders_tell_tasks_apart() -> None:
     ],
 )
 def test_bad_settings_are_one_line(changes: dict[str, object], message: str) -> None:
-    with pytest.raises(SettingError) as caught:
+    with pytest.raises(ConfigError) as caught:
         tasks.of_config(config(**changes))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -177,7 +177,7 @@ def test_bad_settings_are_one_line(changes: dict[str, object], message: str) -> 
 def test_files_that_cannot_be_are_one_line(parts: dict[str, str], message: str, tmp_path: Path) -> None:
     path = tmp_path / "arm.xml"
     path.write_text(ARM.format(**{"density": "1000", "geom": "", "motor": MOTOR} | parts))
-    with pytest.raises(SettingError) as caught:
+    with pytest.raises(ConfigError) as caught:
         tasks.of_config(config(path, dt=0.02))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)

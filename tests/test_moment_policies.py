@@ -124,12 +124,12 @@ def test_moments_are_those_of_samples(kind, x64):
     together = np.concatenate([features, v], 1)
     redrawn = noise.multivariate_normal(together.mean(0), np.cov(together.T), count, method="svd")
     features, u = redrawn[:, :F] - redrawn[:, :F].mean(0), saturated("sine", redrawn[:, F:])
-    centred = u - u.mean(0)
+    centered = u - u.mean(0)
     error = lambda samples: 7 * samples.std(0) / np.sqrt(count)  # noqa: E731
     np.testing.assert_array_less(abs(image.mean - u.mean(0)), error(u))
     for i in range(2):
-        np.testing.assert_array_less(abs(image.cov[i] - np.cov(u.T)[i]), error(centred[:, i, None] * centred))
-        products = features * centred[:, i, None]
+        np.testing.assert_array_less(abs(image.cov[i] - np.cov(u.T)[i]), error(centered[:, i, None] * centered))
+        products = features * centered[:, i, None]
         np.testing.assert_array_less(abs((COV @ image.slope)[:, i] - products.mean(0)), error(products))
 
 

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pegasus_jax.imagine.matching import keep, match
-from pegasus_jax.math.linalg import cholesky, mean_and_cov, standardise
+from pegasus_jax.math.linalg import cholesky, mean_and_cov, standardize
 
 seeds = st.integers(0, 2**16)
 sizes = pytest.mark.parametrize("size", [1, 4, 7])
@@ -112,7 +112,7 @@ def test_mean_and_cov_are_numpys(seed, particles):
 
 @jax.jit
 def balanced_match(x, z):
-    z = standardise(z)
+    z = standardize(z)
     return z, match(x, z)
 
 
@@ -147,8 +147,8 @@ def test_matched_particles_forget_where_each_was():
     assert keep(x, z) is x
 
 
-def test_standardise_is_idempotent_and_works_on_every_time_step_alone():
+def test_standardize_is_idempotent_and_works_on_every_time_step_alone():
     z = jnp.asarray(np.random.default_rng(2).normal(size=(4, 9, 3)) * 5 + 2, jnp.float32)
-    once = standardise(z)
-    np.testing.assert_allclose(standardise(once), once, atol=1e-4)
-    np.testing.assert_allclose(standardise(z[2]), once[2], atol=1e-5)
+    once = standardize(z)
+    np.testing.assert_allclose(standardize(once), once, atol=1e-4)
+    np.testing.assert_allclose(standardize(z[2]), once[2], atol=1e-5)

@@ -53,8 +53,8 @@ def process():
 def dynamics():
     inputs, beta, inverse, lengths, variance = process()
 
-    def moments(belief, mean, cov):
-        return gaussian.rbf_moments(mean, cov, inputs, belief * beta, inverse, lengths, variance)
+    def moments(posterior, mean, cov):
+        return gaussian.rbf_moments(mean, cov, inputs, posterior * beta, inverse, lengths, variance)
 
     return known(PENDULUM)._replace(moments=moments)
 
@@ -279,7 +279,7 @@ def linear_pieces(plant):
     """A known linear plant under u = gain x, with the moments of both."""
     states = len(plant.mean)
     model = known(plant)._replace(
-        moments=lambda belief, mean, cov: gaussian.affine(mean, cov, np.hstack([plant.a - np.eye(states), plant.b]))
+        moments=lambda posterior, mean, cov: gaussian.affine(mean, cov, np.hstack([plant.a - np.eye(states), plant.b]))
     )
     policy: Policy = linear_policy(*plant.b.shape)._replace(
         moments=lambda gain, mean, cov: gaussian.affine(mean, cov, gain)
@@ -329,16 +329,16 @@ def test_a_linear_plant_is_propagated_exactly(plant, noise):
 
 
 def linear_search(plant):
-    """The searcher for the best gain, whose belief scales the cost."""
+    """The searcher for the best gain, whose posterior scales the cost."""
     start = (jnp.asarray(plant.mean), jnp.diag(jnp.asarray(plant.std**2)))
 
-    def value(gain, belief, std):
-        return belief * search.objective(
+    def value(gain, posterior, std):
+        return posterior * search.objective(
             gain, None, start, std, horizon=plant.horizon, **linear_pieces(plant),
             expected_cost=lambda mean, cov: mean @ plant.q @ mean + jnp.trace(plant.q @ cov),
         )  # fmt: skip
 
-    searcher = search.analytic(value, lambda key, belief: jnp.zeros(len(plant.mean)))
+    searcher = search.analytic(value, lambda key, posterior: jnp.zeros(len(plant.mean)))
     return searcher, jax.jit(searcher.run, static_argnames="steps")
 
 
@@ -388,10 +388,10 @@ def test_a_new_search_remembers_nothing_but_the_parameters():
 def test_the_search_stays_where_the_objective_is_finite():
     """The function ends at .5: beyond, it is NaN."""
 
-    def value(x, belief, std):
+    def value(x, posterior, std):
         return -x + jnp.where(x > 0.5, jnp.nan, 0.0) * x
 
-    searcher = search.analytic(value, lambda key, belief: jnp.zeros(1))
+    searcher = search.analytic(value, lambda key, posterior: jnp.zeros(1))
     start = jnp.zeros(())
     learner, info = jax.jit(partial(searcher.run, steps=20))(
         jax.random.key(0), Learner(start, searcher.init(start)), None, first=0

@@ -11,7 +11,7 @@ import pytest
 
 from pegasus_jax import config
 from pegasus_jax.builder import compose
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.learn.multistart import best_of
 from pegasus_jax.learn.search import SearchInfo
 from pegasus_jax.types import Learner, Searcher
@@ -20,18 +20,18 @@ from probes import cart, noisy_linear_policy, regression, same, tiny, unchecked
 STARTS, STEPS, DEEPER = 4, 60, 0.1
 
 
-def wells(params, belief):
-    """Two valleys, at -1 and 1; the belief says how much deeper that at 1 is. Beyond 3 nothing is known."""
-    return jnp.where(params > 3, jnp.nan, (params**2 - 1) ** 2 - belief * params)
+def wells(params, posterior):
+    """Two valleys, at -1 and 1; the posterior says how much deeper that at 1 is. Beyond 3 nothing is known."""
+    return jnp.where(params > 3, jnp.nan, (params**2 - 1) ** 2 - posterior * params)
 
 
 def descent():
     """Plain gradient descent, as a searcher without scenarios."""
     optimizer = optax.sgd(0.02, momentum=0.5)
 
-    def run(key, learner, belief, *, first, steps, earlier=0):
+    def run(key, learner, posterior, *, first, steps, earlier=0):
         def step(learner, _):
-            value, gradient = jax.value_and_grad(wells)(learner.params, belief)
+            value, gradient = jax.value_and_grad(wells)(learner.params, posterior)
             updates, state = optimizer.update(gradient, learner.optimizer)
             return Learner(learner.params + updates, state), (value, jnp.abs(gradient))
 
@@ -111,7 +111,7 @@ def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():
     chosen = tiny(trials=2, fit__steps=5, search__steps=4, search__particles=5, search__starts=3)
     exp = compose(chosen, cart(), dynamics=regression(2, 1), policy=noisy_linear_policy(cart()))
     state = exp.init(jax.random.key(0))
-    after, (_, info) = unchecked(jax.jit(lambda s: exp.improve(exp.absorb(s, exp.collect(s)))))(state)
+    after, (_, info) = unchecked(jax.jit(lambda s: exp.improve(exp.add_episode(s, exp.collect(s)))))(state)
     shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (state.policy, after.policy)]
     assert shapes[0] == shapes[1]
     assert info.objective.shape == (4,)
@@ -122,5 +122,5 @@ def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():
 
 
 def test_starts_begin_every_search_anew():
-    with pytest.raises(SettingError, match=r"search\.starts=4 begins every search anew; it needs search\.reset=true"):
+    with pytest.raises(ConfigError, match=r"search\.starts=4 begins every search anew; it needs search\.reset=true"):
         config.Search(starts=4, reset=False)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pegasus_jax import preset
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import KINDS, TASKS, Config
 from pegasus_jax.presets import ALGORITHMS, MODELS, NETWORKS, POLICIES, PRESETS, WORDS, own
 from pegasus_jax.runs import config_io
@@ -108,14 +108,14 @@ def test_the_gpus_preset_is_the_double_cartpoles_with_eight_policies():
     ],
 )
 def test_words_that_contradict_a_preset_end_in_one_line(text, part):
-    with pytest.raises(SettingError) as refused:
+    with pytest.raises(ConfigError) as refused:
         parse(text)
     assert part in str(refused.value)
     assert len(str(refused.value).splitlines()) == 1
 
 
 def test_an_unknown_word_in_python_is_named():
-    with pytest.raises(SettingError, match=r"model=lognormal is unknown; did you mean 'log_normal'"):
+    with pytest.raises(ConfigError, match=r"model=lognormal is unknown; did you mean 'log_normal'"):
         preset("cartpole", model="lognormal")
 
 

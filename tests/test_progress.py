@@ -172,7 +172,8 @@ def test_a_terminal_says_that_it_compiles_and_goes_on(monkeypatch: pytest.Monkey
 def test_nothing_slow_is_imported_before_the_first_line() -> None:
     """JAX and MuJoCo take seconds; what a command will do is known without them."""
     code = (
-        "import sys, pegasus_jax.cli.main, pegasus_jax.runs.display, pegasus_jax.runs.store, pegasus_jax.runs.config_io\n"
+        "import sys, pegasus_jax.cli.main\n"
+        "from pegasus_jax.runs import display, store, config_io\n"
         "print(*{'jax', 'mujoco', 'gymnasium', 'scipy', 'matplotlib'} & set(sys.modules))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -12,7 +12,7 @@ MANY = 100_000
 
 
 def test_uniforms_are_uniform_and_never_at_an_end():
-    """A Kolmogorov-Smirnov test of all, and of each half of the bits, whose neighbours do not depend on each other."""
+    """A Kolmogorov-Smirnov test of all, and of each half of the bits, whose neighbors do not depend on each other."""
     draws = np.asarray(uniforms(jax.random.key(0), MANY))
     assert draws.shape == (MANY,)
     assert 0 < draws.min() < 1e-4

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from folders import a_run, episode, row
-from pegasus_jax.checks import RunError, SettingError
+from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.runs import files, store
 from pegasus_jax.runs.store import best_trial
 
@@ -228,13 +228,13 @@ def test_a_folder_is_taken_once(made: Path, tmp_path: Path) -> None:
         with pytest.raises(RunError, match="another process"):
             store.lock(tmp_path / "run", new=True)
         shutil.copy(made / "config.yaml", tmp_path / "run")
-    with pytest.raises(SettingError, match="holds a run already"):
+    with pytest.raises(ConfigError, match="holds a run already"):
         store.lock(tmp_path / "run", new=True)
     with store.lock(tmp_path / "run"):
         pass
     (tmp_path / "run" / "config.yaml").unlink()
     shutil.copytree(made / "episodes", tmp_path / "run" / "episodes")
-    with pytest.raises(SettingError, match="holds episodes of a run without"):
+    with pytest.raises(ConfigError, match="holds episodes of a run without"):
         store.create(tmp_path / "run")
 
 

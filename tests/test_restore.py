@@ -12,7 +12,7 @@ import pytest
 from folders import a_run
 from pegasus_jax import tasks
 from pegasus_jax.builder import build
-from pegasus_jax.checks import RunError, SettingError
+from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.runs import checkpoint, config_io, restore, store
 from test_train import call
 
@@ -59,7 +59,7 @@ def test_a_state_of_other_settings_is_refused_with_the_difference(run: Path) -> 
         restore.planted(run, config_io.load(run / "config.yaml"))
 
 
-def test_another_optimiser_leaves_what_was_learned(run: Path) -> None:
+def test_another_optimizer_leaves_what_was_learned(run: Path) -> None:
     _, _, before = restore.restored(run, 2)
     change(run, search__best=True, trials=9)
     _, experiment, state = restore.restored(run, 2)
@@ -188,5 +188,5 @@ def test_a_model_that_was_moved_is_known_by_its_content(tmp_path: Path, monkeypa
     (tmp_path / "elsewhere" / "new.xml").write_text(ARM.replace('mass="1"', 'mass="2"'))
     with pytest.raises(RunError, match="its mjcf_digest was"):
         restore.planted(run, now)
-    with pytest.raises(SettingError, match="of no use here"):
+    with pytest.raises(ConfigError, match="of no use here"):
         restore.moved(run, config_io.parse({"task": "cartpole"}), "new.xml")

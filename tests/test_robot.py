@@ -16,7 +16,7 @@ import pytest
 
 from pegasus_envs.gym_plant import env_spec
 from pegasus_jax import controller
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io, store
 from pegasus_jax.runs.restore import restored
@@ -206,6 +206,6 @@ def test_facts_that_are_given_are_not_asked_for() -> None:
 def test_runs_that_were_not_evaluated_have_no_curves_to_compare(learned: Path) -> None:
     with pytest.raises(RunError, match="evaluation=0"):
         seeds_picture([learned / "run"], learned / "learning.png")
-    with pytest.raises(SettingError, match="evaluation=0"):
+    with pytest.raises(ConfigError, match="evaluation=0"):
         study.study(Config(evaluation=0), [0])
     assert config_io.load(learned / "run" / "config.yaml").start_mean == (3.14, 0.0)

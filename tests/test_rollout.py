@@ -26,12 +26,12 @@ seeds = st.integers(0, 2**16)
 def jitted():
     """Seed -> scenarios, and (scenarios, match) -> rollout, compiled once."""
     r = rig(K, H)
-    scenarios = jax.jit(lambda seed: draw(jax.random.key(seed), 0, r.belief, blocks=r.blocks, period=Period()))
+    scenarios = jax.jit(lambda seed: draw(jax.random.key(seed), 0, r.posterior, blocks=r.blocks, period=Period()))
     roll = {
         name: jax.jit(partial(rollout, dynamics=r.dynamics, policy=r.policy, match=match, noise=NOISE))
         for name, match in MATCHES.items()
     }
-    return scenarios, lambda given, name: roll[name](r.params, r.belief, given)
+    return scenarios, lambda given, name: roll[name](r.params, r.posterior, given)
 
 
 def match_numpy(x, z):
@@ -50,7 +50,7 @@ def test_the_scan_equals_a_python_loop(match, jitted):
         u, after, std = [], [], []
         for k, (mask, weights) in enumerate(draws):
             u.append(np.asarray(act(r.params, mask, x[k] + NOISE.policy * blur[k])))
-            change = predict(r.belief, weights, x[k], u[k])
+            change = predict(r.posterior, weights, x[k], u[k])
             after.append(x[k] + change.mean + NOISE.state * change.std * given.sensor[t, k])
             std.append(change.std)
         x, std = np.array(after), np.array(std)
@@ -72,7 +72,7 @@ def test_an_unrolled_loop_is_the_loop(jitted, monkeypatch):
 
     def value(params):
         rolled = rollout(
-            params, r.belief, given, dynamics=r.dynamics, policy=r.policy, match=matching.match, noise=NOISE
+            params, r.posterior, given, dynamics=r.dynamics, policy=r.policy, match=matching.match, noise=NOISE
         )
         return sum(jnp.sum(jnp.sin(leaf)) for leaf in rolled)
 
@@ -104,7 +104,7 @@ def test_k_particles_are_k_rollouts_of_one(jitted):
             given.sensor[:, one],
             given.match[:, one],
         )
-        for a, b in zip(alone(r.params, r.belief, only), together, strict=True):
+        for a, b in zip(alone(r.params, r.posterior, only), together, strict=True):
             np.testing.assert_allclose(a[:, 0], b[:, k], rtol=1e-5, atol=1e-5)
 
 
@@ -157,7 +157,7 @@ def controller(apply):
 
 
 def test_a_particle_holds_its_draws_for_the_whole_trajectory():
-    dynamics = model(lambda belief, draw, x, u: Prediction(draw, jnp.zeros(2)))
+    dynamics = model(lambda posterior, draw, x, u: Prediction(draw, jnp.zeros(2)))
     policy = controller(lambda params, noise, x: noise[None])
     imagined = rollout(None, None, CONSTANT, dynamics=dynamics, policy=policy, match=matching.keep)
     steps = np.diff(imagined.x, axis=0)
@@ -167,8 +167,10 @@ def test_a_particle_holds_its_draws_for_the_whole_trajectory():
 
 
 def test_a_model_of_all_particles_at_once_is_taken_for_the_model_of_one():
-    one = model(lambda belief, draw, x, u: Prediction(draw, jnp.zeros(2)))
-    many = one._replace(particles=lambda apply: lambda belief, draws, x, u: Prediction(draws[::-1], jnp.zeros((3, 2))))
+    one = model(lambda posterior, draw, x, u: Prediction(draw, jnp.zeros(2)))
+    many = one._replace(
+        particles=lambda apply: lambda posterior, draws, x, u: Prediction(draws[::-1], jnp.zeros((3, 2)))
+    )
     pieces = dict(policy=controller(lambda params, noise, x: noise[None]), match=matching.keep)
     steps = [np.diff(rollout(None, None, CONSTANT, dynamics=d, **pieces).x, axis=0) for d in (one, many)]
     np.testing.assert_allclose(steps[0], steps[1][:, ::-1], atol=1e-5)
@@ -188,7 +190,7 @@ def test_noise_factors_do_what_they_say(policy_factor, state_factor):
 
 @jax.jit
 def STILL(noise, std):
-    dynamics = model(lambda belief, draw, x, u: Prediction(jnp.zeros(2), std))
+    dynamics = model(lambda posterior, draw, x, u: Prediction(jnp.zeros(2), std))
     policy = controller(lambda params, noise, x: x)
     return rollout(None, None, CONSTANT, dynamics=dynamics, policy=policy, match=matching.keep, noise=noise)
 
@@ -204,7 +206,7 @@ def test_no_gradient_flows_through_the_predicted_noise(factor):
     policy = controller(lambda params, draw, x: jnp.stack([params, x[0]]))  # what the std depends on; what is seen
 
     def loss(params, through_mean):
-        dynamics = model(lambda belief, draw, x, u: Prediction(through_mean * u[:1] * jnp.ones(2), (u[0] * x) ** 2))
+        dynamics = model(lambda posterior, draw, x, u: Prediction(through_mean * u[:1] * jnp.ones(2), (u[0] * x) ** 2))
         imagined = rollout(params, None, CONSTANT, dynamics=dynamics, policy=policy, match=matching.keep, noise=noise)
         return jnp.sum(imagined.x[1:] ** 2) + jnp.sum(imagined.u[..., 1] ** 2)
 

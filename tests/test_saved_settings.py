@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pegasus_jax import config, config_models
-from pegasus_jax.checks import SettingError, shown
+from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
 from pegasus_jax.presets import ALGORITHMS
 from pegasus_jax.runs import config_io
@@ -71,7 +71,7 @@ NO_CONFIGS = {
     "prose": "no config",
     "list": "[1, 2]",
     "broken": "seed: [",
-    "unknown": "colour: red",
+    "unknown": "color: red",
     "wrong type": "seed: many",
     "impossible": "trials: 0",
     "nested": "policy.hidden: {a: 1}",
@@ -83,13 +83,13 @@ NO_CONFIGS = {
 def test_a_file_that_is_no_config_says_so(name, tmp_path):
     path = tmp_path / "config.yaml"
     path.write_text(NO_CONFIGS[name], encoding="utf-8")
-    with pytest.raises(SettingError) as caught:
+    with pytest.raises(ConfigError) as caught:
         config_io.load(path)
     assert len(str(caught.value).splitlines()) == 1
 
 
 def test_a_missing_config_says_so(tmp_path):
-    with pytest.raises(SettingError, match=r"config\.yaml"):
+    with pytest.raises(ConfigError, match=r"config\.yaml"):
         config_io.load(tmp_path / "config.yaml")
 
 
@@ -124,11 +124,11 @@ def test_a_removed_setting_is_read_at_its_old_default_and_refused_at_another_val
     assert config_io.load(path) == chosen
     other = {bool: not always, str: "another", type(None): 3}.get(type(always), 0.25)
     path.write_text(f"{today}{key}: {shown(other)}\n", encoding="utf-8")
-    with pytest.raises(SettingError) as refused:
+    with pytest.raises(ConfigError) as refused:
         config_io.load(path)
     assert f"{path}: {key}={shown(other)} was removed, only {shown(always)} is left" in str(refused.value)
     for call in (lambda: parse(f"{key}={shown(always)}"), lambda: config_io.override(chosen, {key: always})):
-        with pytest.raises(SettingError, match=rf"^{key} was removed; instead: ") as refused:
+        with pytest.raises(ConfigError, match=rf"^{key} was removed; instead: ") as refused:
             call()
         assert len(str(refused.value).splitlines()) == 1
         named = re.findall(r"(\w+\.\w+)=", str(refused.value))

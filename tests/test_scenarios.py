@@ -10,13 +10,13 @@ from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
 from pegasus_jax.imagine import scenarios
-from pegasus_jax.math.linalg import standardise
+from pegasus_jax.math.linalg import standardize
 from pegasus_jax.types import Period, Scenarios
 from probes import rig, same
 
 STEPS = 7
 # The same sampler for every block: two blocks with one key would show as equal draws.
-PLAIN = scenarios.Blocks(*[lambda key, belief: belief * jax.random.bits(key, (2,))] * 5)
+PLAIN = scenarios.Blocks(*[lambda key, posterior: posterior * jax.random.bits(key, (2,))] * 5)
 periods = st.builds(Period, *[st.integers(0, STEPS + 1)] * 5)
 
 
@@ -52,7 +52,7 @@ def test_periods(period, seed, first):
 
 
 def test_the_belief_of_the_day_reaches_the_draws():
-    """The model's draws are of the belief given, not of one closed over."""
+    """The model's draws are of the posterior given, not of one closed over."""
     pieces = dict(blocks=PLAIN, period=Period())
     one, two = (scenarios.draw(jax.random.key(0), 0, jnp.uint32(b), **pieces) for b in (1, 2))
     assert np.array_equal(2 * one.dynamics, two.dynamics)
@@ -62,7 +62,7 @@ def test_the_belief_of_the_day_reaches_the_draws():
 def drawn():
     r = rig(particles=50)
     return jax.jit(partial(scenarios.draw, step=0, blocks=r.blocks, period=Period()))(
-        jax.random.key(0), belief=r.belief
+        jax.random.key(0), posterior=r.posterior
     )
 
 
@@ -95,7 +95,7 @@ def test_balanced_noise_has_the_moments_at_every_step():
 
     @jax.jit
     def draw(key):
-        return [sampler(jax.random.clone(key), r.belief) for sampler in samplers]
+        return [sampler(jax.random.clone(key), r.posterior) for sampler in samplers]
 
     *both, plain = draw(jax.random.key(0))
     for z in both:
@@ -103,4 +103,4 @@ def test_balanced_noise_has_the_moments_at_every_step():
         np.testing.assert_allclose(z.mean(1), 0, atol=1e-5)
         for at_t in np.asarray(z):
             np.testing.assert_allclose(np.cov(at_t.T), np.eye(3), atol=1e-4)
-    np.testing.assert_allclose(standardise(plain), z, atol=1e-4)  # the same draw, balanced
+    np.testing.assert_allclose(standardize(plain), z, atol=1e-4)  # the same draw, balanced

@@ -1,4 +1,4 @@
-"""Policy search: the objective against closed forms and finite differences, the optimiser against a loop."""
+"""Policy search: the objective against closed forms and finite differences, the optimizer against a loop."""
 
 from functools import partial
 
@@ -40,10 +40,10 @@ from probes import (
 def on_rig():
     """(seed) -> scenarios, scenarios -> (objective, gradient), compiled once."""
     r = rig()
-    draw = jax.jit(lambda seed: scenarios.draw(jax.random.key(seed), 0, r.belief, blocks=r.blocks, period=Period()))
+    draw = jax.jit(lambda seed: scenarios.draw(jax.random.key(seed), 0, r.posterior, blocks=r.blocks, period=Period()))
     value = partial(objective, dynamics=r.dynamics, policy=r.policy, match=matching.match, cost=r.cost)
     gradient = jax.jit(jax.value_and_grad(value))
-    return draw, lambda given: gradient(r.params, r.belief, given)
+    return draw, lambda given: gradient(r.params, r.posterior, given)
 
 
 @given(seed=st.integers(0, 2**16))
@@ -73,16 +73,16 @@ def test_the_gradient_equals_finite_differences(x64):
     """With the noise held the objective is an ordinary function. The model's noise is homoscedastic here, because no
     gradient is meant to flow through a predicted one."""
     r = make_rig(particles=7, horizon=4, heteroscedastic=False)
-    given = jax.jit(lambda k: scenarios.draw(k, 0, r.belief, blocks=r.blocks, period=Period()))(jax.random.key(0))
+    given = jax.jit(lambda k: scenarios.draw(k, 0, r.posterior, blocks=r.blocks, period=Period()))(jax.random.key(0))
     pieces = dict(dynamics=r.dynamics, policy=r.policy, match=matching.match, cost=r.cost, noise=NoiseUse(1.0, 0.5))
     value = jax.jit(partial(objective, **pieces))
-    gradient = jax.jit(jax.grad(partial(objective, **pieces)))(r.params, r.belief, given)
+    gradient = jax.jit(jax.grad(partial(objective, **pieces)))(r.params, r.posterior, given)
     for seed in range(4):
         noise = np.random.default_rng(seed)
         direction = jax.tree.map(lambda leaf, noise=noise: jnp.asarray(noise.normal(size=leaf.shape)), r.params)
         direction |= {"input": jax.tree.map(jnp.zeros_like, r.params["input"])}  # which is not learned
         move = lambda step, d=direction: jax.tree.map(lambda p, v: p + step * v, r.params, d)  # noqa: E731
-        slope = (value(move(1e-6), r.belief, given) - value(move(-1e-6), r.belief, given)) / 2e-6
+        slope = (value(move(1e-6), r.posterior, given) - value(move(-1e-6), r.posterior, given)) / 2e-6
         np.testing.assert_allclose(optax.tree.vdot(gradient, direction), slope, rtol=1e-5, atol=1e-9)
         assert abs(slope) > 1e-4
 
@@ -171,37 +171,37 @@ def test_a_known_control_is_found_through_limits_and_costs():
         jax.random.key(0),
         Learner(jnp.zeros(1), optimizer.init(jnp.zeros(1))),
         None,
-        sampler=Sampler(lambda *_: jnp.zeros(()), lambda key, step, held, belief: held),
-        objective=lambda params, belief, given: cost_of(2 * jnp.tanh(params)),
+        sampler=Sampler(lambda *_: jnp.zeros(()), lambda key, step, held, posterior: held),
+        objective=lambda params, posterior, given: cost_of(2 * jnp.tanh(params)),
         optimizer=optimizer,
         steps=200,
     )
     np.testing.assert_allclose(2 * jnp.tanh(learner.params), best, atol=5e-3)
 
 
-# The optimiser, on an objective simple enough to follow by hand: |params - scenarios|^2
+# The optimizer, on an objective simple enough to follow by hand: |params - scenarios|^2
 
 
-def follow(key, step, belief):
+def follow(key, step, posterior):
     """A target of its own for every iteration."""
     return jax.random.normal(jax.random.fold_in(key, step), (3,))
 
 
-def distance(params, belief, target):
-    return jnp.sum((params - target) ** 2) * belief
+def distance(params, posterior, target):
+    return jnp.sum((params - target) ** 2) * posterior
 
 
 def pursue(optimizer, steps, *, bad=(), value=jnp.nan, scale=1.0):
     """A jitted search whose target is `value` at the iterations `bad`."""
 
-    def draw(key, step, belief):
+    def draw(key, step, posterior):
         spoiled = jnp.isin(step, jnp.asarray(bad, jnp.int32)) if bad else False
-        return jnp.where(spoiled, value, scale * follow(key, step, belief))
+        return jnp.where(spoiled, value, scale * follow(key, step, posterior))
 
     return jax.jit(
         partial(
             gradient_search,
-            sampler=Sampler(draw, lambda key, step, held, belief: draw(key, step, belief)),
+            sampler=Sampler(draw, lambda key, step, held, posterior: draw(key, step, posterior)),
             objective=distance,
             optimizer=optimizer,
             steps=steps,
@@ -236,13 +236,13 @@ def test_the_search_is_gradient_descent_on_the_scenarios_of_each_iteration():
 
 def on_table(table, optimizer, draw=follow, value=distance, **more):
     """(searcher of a table, its learner at ones); the objective ignores the row unless `value` takes it."""
-    drawing = Sampler(draw, lambda key, step, held, belief: draw(key, step, belief))
+    drawing = Sampler(draw, lambda key, step, held, posterior: draw(key, step, posterior))
     found = searcher(Problem(value, drawing, optimizer, table, **more))
     return found, Learner(jnp.ones(3), found.init(jnp.ones(3)))
 
 
-def rowless(params, belief, target, row):
-    return distance(params, belief, target)
+def rowless(params, posterior, target, row):
+    return distance(params, posterior, target)
 
 
 STILL = lambda *_: jnp.zeros(3)  # noqa: E731
@@ -317,7 +317,7 @@ def test_each_iteration_has_its_width_wherever_the_search_is_cut():
 
 
 def test_the_table_search_skips_and_counts_bad_gradients_as_the_plain_one_does():
-    draw = lambda key, step, belief: jnp.where(step == 2, jnp.nan, follow(key, step, belief))  # noqa: E731
+    draw = lambda key, step, posterior: jnp.where(step == 2, jnp.nan, follow(key, step, posterior))  # noqa: E731
     found, learner = on_table(search_table(5), optax.adam(0.1), draw, rowless)
     ours, info = found.run(jax.random.key(7), learner, 1.0, steps=5)
     plain, expected = pursue(optax.adam(0.1), 5, bad=(2,))(jax.random.key(7), begin(optax.adam(0.1)), 1.0)
@@ -328,7 +328,7 @@ def test_the_table_search_skips_and_counts_bad_gradients_as_the_plain_one_does()
 
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_bad_gradient_skips_its_update_and_nothing_else(value):
-    """Parameters and optimiser state are those of a search that never had these iterations."""
+    """Parameters and optimizer state are those of a search that never had these iterations."""
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.1))
     learner, info = pursue(optimizer, 8, bad=(2, 3, 6), value=value)(jax.random.key(7), begin(optimizer), 1.0)
     expected = loop(optimizer, [0, 1, 4, 5, 7])
@@ -378,18 +378,18 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     optimizer = optax.chain(optax.clip_by_global_norm(1.0), optax.adam(0.01))
     found = searcher(Problem(lambda *given: value(*given[:3]), draws, optimizer, search_table(6)))
     compiled = partial(jax.jit, compiler_options=EMITTERS)
-    key, belief = jax.random.key(3), jnp.full((3, 2), 0.2)
+    key, posterior = jax.random.key(3), jnp.full((3, 2), 0.2)
     params = jnp.full((1, 2), 0.3)
     begins = learner = Learner(params, found.init(params))
-    whole, info = compiled(partial(found.run, steps=6))(key, learner, belief)
+    whole, info = compiled(partial(found.run, steps=6))(key, learner, posterior)
     part, values = compiled(partial(found.run, steps=2)), []
     for first in (0, 2, 4):
-        learner, chunk = part(key, learner, belief, first=first)
+        learner, chunk = part(key, learner, posterior, first=first)
         values.append(chunk.objective)
     assert same(whole, learner)
     assert np.array_equal(info.objective, np.concatenate(values))
     assert len(np.unique(info.objective)) == 6
     # Alg. 3 as printed is the table of nothing but steps.
     printed = partial(gradient_search, objective=value, sampler=draws, optimizer=optimizer, steps=6)
-    plain, expected = compiled(printed)(key, Learner(params, begins.optimizer.optimizer), belief)
+    plain, expected = compiled(printed)(key, Learner(params, begins.optimizer.optimizer), posterior)
     assert same((plain.params, plain.optimizer, expected), (whole.params, whole.optimizer.optimizer, info))

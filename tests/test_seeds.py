@@ -101,7 +101,7 @@ def test_a_gpu_is_told_how_to_run_loops_unless_the_user_says(monkeypatch: pytest
 def test_how_it_is_compiled_changes_no_result() -> None:
     """Graphs of kernels where these tests run on a GPU, wide vectors on a processor. A few steps: rounding grows."""
     experiment = compose(tiny(), cart())
-    given = experiment.absorb(state := experiment.init(jax.random.key(0)), experiment.collect(state))
+    given = experiment.add_episode(state := experiment.init(jax.random.key(0)), experiment.collect(state))
     for part in (partial(experiment.fit, steps=10), partial(experiment.search, steps=5)):
         lowered = jax.jit(part).lower(given)
         (given, plainly), (_, as_a_run) = (
@@ -233,8 +233,8 @@ def test_a_seed_that_diverges_leaves_the_others_as_they_are() -> None:
     init, improve = map(unchecked, over)
     states = init(jnp.stack([jax.random.key(0), jax.random.key(1)]))
     collect = unchecked(jax.jit(over_seeds(exp.collect, (0,), seeds=2)))
-    absorb = jax.jit(over_seeds(exp.absorb, (0, 0), seeds=2))
-    states = absorb(states, collect(states))
+    add_episode = jax.jit(over_seeds(exp.add_episode, (0, 0), seeds=2))
+    states = add_episode(states, collect(states))
     poisoned = states._replace(data=states.data._replace(y=states.data.y.at[1].set(jnp.nan)))
     (healthy, _), (mixed, info) = improve(states), improve(poisoned)
     for a, b in zip(jax.tree.leaves(healthy.policy), jax.tree.leaves(mixed.policy), strict=True):

@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pegasus_jax.builder import compose
-from pegasus_jax.checks import SettingError, shown
+from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import BNN, KINDS, RBF, Analytic, Config, Lagrangian, Period, Search
 from pegasus_jax.runs import config_io
 from probes import cart
@@ -136,7 +136,7 @@ def test_the_iterations_of_lbfgs_are_not_those_a_task_gives_its_minibatches():
 
 @pytest.mark.parametrize("section", KINDS)
 def test_the_kind_of_a_section_is_not_a_setting(section):
-    with pytest.raises(SettingError, match=rf"{section}\.kind=other.*(model|policy|algorithm)="):
+    with pytest.raises(ConfigError, match=rf"{section}\.kind=other.*(model|policy|algorithm)="):
         parse(f"{section}.kind=other")
 
 
@@ -145,7 +145,7 @@ def test_a_stored_kind_that_is_unknown_is_named(section, tmp_path):
     path = tmp_path / "config.yaml"
     config_io.save(Config(), path)
     path.write_text(path.read_text().replace(f"{section}.kind: ", f"{section}.kind: un"), encoding="utf-8")
-    with pytest.raises(SettingError, match=rf"{section}\.kind=un.*is unknown"):
+    with pytest.raises(ConfigError, match=rf"{section}\.kind=un.*is unknown"):
         config_io.load(path)
 
 
@@ -291,7 +291,7 @@ WRONG = [
 
 @pytest.mark.parametrize(("words", "parts"), WRONG, ids=[" ".join(words) for words, _ in WRONG])
 def test_a_wrong_word_ends_in_one_line_that_helps(words, parts):
-    with pytest.raises(SettingError) as caught:
+    with pytest.raises(ConfigError) as caught:
         parse(*words)
     message = str(caught.value)
     assert "\n" not in message
@@ -304,7 +304,7 @@ def fate(word):
     """What a word ends in: a config, or the lines of a refusal."""
     try:
         return parse(word)
-    except SettingError as error:
+    except ConfigError as error:
         return str(error).splitlines()
 
 
@@ -339,7 +339,7 @@ TOGETHER = [
 
 @pytest.mark.parametrize("words", TOGETHER, ids=" ".join)
 def test_settings_that_no_piece_can_obey_end_in_one_line_too(words):
-    with pytest.raises(SettingError) as caught:
+    with pytest.raises(ConfigError) as caught:
         compose(parse(*words), cart())
     assert "\n" not in str(caught.value)
     assert words[-1].partition("=")[0].split(".")[-1] in str(caught.value) or "particles" in str(caught.value)

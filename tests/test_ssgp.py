@@ -42,7 +42,7 @@ def test_evidence_and_posterior_are_those_of_the_bayesian_linear_model(x64):
     data, model, params = experience(), ssgp(**SHAPES, points=12), parameters(12)
     rows, h = model.prepare(data), kernels.hyper(params)
     inputs, y, _, _ = rows_by_hand(data)
-    belief = jax.jit(model.condition)(params, data)
+    posterior = jax.jit(model.posterior)(params, data)
     noise = np.exp(params["log_noise"])
     total = 0.0
     for e in range(3):
@@ -58,8 +58,8 @@ def test_evidence_and_posterior_are_those_of_the_bayesian_linear_model(x64):
         gain = features.T @ np.linalg.inv(marginal)
         scale = np.exp(params["log_signal"][e]) / np.sqrt(12)
         cov = np.eye(24) - gain @ features
-        np.testing.assert_allclose(belief.weights.mean[e], scale * gain @ y[e], rtol=1e-8, atol=1e-10)
-        np.testing.assert_allclose(belief.cov[e], scale**2 * cov, rtol=1e-7, atol=1e-11)
+        np.testing.assert_allclose(posterior.weights.mean[e], scale * gain @ y[e], rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose(posterior.cov[e], scale**2 * cov, rtol=1e-7, atol=1e-11)
     high = np.sum(np.asarray(params["points"]) ** 2) / 12
     loss = jax.jit(model.loss)(params, None, None, rows)
     np.testing.assert_allclose(loss * 30, kernels.penalty(h) + high - total, rtol=1e-10)
@@ -68,12 +68,12 @@ def test_evidence_and_posterior_are_those_of_the_bayesian_linear_model(x64):
 def test_draws_are_functions_of_the_posterior():
     """Weights by weights: the values of 20000 draws at one input have the moments of the posterior predictive."""
     data, model, params = experience(), ssgp(**SHAPES, points=12), parameters(12)
-    belief = jax.jit(model.condition)(params, data)
+    posterior = jax.jit(model.posterior)(params, data)
     x, u = data.x[3] + 0.3, data.u[5]
-    draws = jax.jit(jax.vmap(model.sample, (0, None)))(jax.random.split(jax.random.key(0), 20_000), belief)
-    ahead = jax.jit(jax.vmap(model.apply, (None, 0, None, None)))(belief, draws, x, u)
+    draws = jax.jit(jax.vmap(model.sample, (0, None)))(jax.random.split(jax.random.key(0), 20_000), posterior)
+    ahead = jax.jit(jax.vmap(model.apply, (None, 0, None, None)))(posterior, draws, x, u)
     raw = jnp.concatenate([x[:2], jnp.sin(x[2:]), jnp.cos(x[2:]), u])
-    image = jax.jit(model.moments)(belief, raw, jnp.zeros((6, 6)))
+    image = jax.jit(model.moments)(posterior, raw, jnp.zeros((6, 6)))
     std = np.sqrt(np.diag(image.cov))
     np.testing.assert_array_less(abs(np.mean(ahead.mean, 0) - image.mean), 5 * std / 20_000**0.5)
     np.testing.assert_allclose(np.std(ahead.mean, 0), std, rtol=0.03)
@@ -97,12 +97,12 @@ def test_with_many_frequencies_it_is_the_gaussian_process(x64):
     """Its error falls as the square root of their number: 16 times as many make it 4 times as small."""
     data, process = experience(), exact.gp(**SHAPES)
     params = parameters(1, noise=0.3)
-    belief = jax.jit(process.condition)(params, data)
+    posterior = jax.jit(process.posterior)(params, data)
     at = np.asarray(jnp.concatenate([data.x[:10, :2], jnp.sin(data.x[:10, 2:]), jnp.cos(data.x[:10, 2:])], 1))
     at = np.concatenate([at, np.asarray(data.u)[:10]], 1)
     at = jnp.asarray(at + 0.3 * np.random.default_rng(1).normal(size=at.shape))
     nothing = jnp.zeros((6, 6))
-    expected = jax.jit(jax.vmap(process.moments, (None, 0, None)))(belief, at, nothing)
+    expected = jax.jit(jax.vmap(process.moments, (None, 0, None)))(posterior, at, nothing)
     evidence = jax.jit(exact.log_evidence)(kernels.hyper(params), process.prepare(data))
 
     def errors(points):
@@ -111,7 +111,7 @@ def test_with_many_frequencies_it_is_the_gaussian_process(x64):
         @jax.jit
         def one(key):
             mine = params | {"points": jax.random.normal(key, (3, points, 6))}
-            image = jax.vmap(model.moments, (None, 0, None))(model.condition(mine, data), at, nothing)
+            image = jax.vmap(model.moments, (None, 0, None))(model.posterior(mine, data), at, nothing)
             h, rows = kernels.hyper(mine), model.prepare(data)
             mine_evidence = jax.vmap(log_evidence, (0, 0, 0, 0, None))(
                 mine["points"] / h.lengthscale[:, None], h.signal, h.noise, rows.y, rows

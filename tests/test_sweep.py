@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import check, handle, jobs_of, values
 from pegasus_jax.runs import config_io, store
 from test_train import TINY
@@ -67,7 +67,7 @@ def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
         job.run.mkdir()
         (job.run / "config.yaml").touch()
     assert store.seeds_of(tmp_path) == dict(zip((3, 4, 5), (job.run for job in jobs), strict=True))
-    with pytest.raises(SettingError, match="holds a run already"):
+    with pytest.raises(ConfigError, match="holds a run already"):
         check(jobs[0])
 
 
@@ -90,7 +90,7 @@ def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
     ],
 )
 def test_what_cannot_be_is_said_before_anything_starts(words: list[str], message: str, tmp_path: Path) -> None:
-    with pytest.raises(SettingError, match=message) as said:
+    with pytest.raises(ConfigError, match=message) as said:
         handle(["task=cartpole", *words, f"out={tmp_path / 'sweep'}"])
     assert "\n" not in str(said.value)
     assert not list(tmp_path.rglob("config.yaml"))

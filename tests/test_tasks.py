@@ -14,7 +14,7 @@ import pytest
 
 from pegasus_jax import tasks
 from pegasus_jax.builder import build
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io, store
 
@@ -82,7 +82,7 @@ def test_the_resolved_config_survives_its_file(tmp_path: Path) -> None:
 
 
 def test_an_unknown_task_is_named() -> None:
-    with pytest.raises(SettingError, match="did you mean 'double_cartpole'"):
+    with pytest.raises(ConfigError, match="did you mean 'double_cartpole'"):
         tasks.make("double_cartpol")
 
 

@@ -248,7 +248,7 @@ def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:
 
 
 def test_a_run_goes_on_with_another_search(whole: Path, tmp_path: Path) -> None:
-    """Also with one whose optimiser remembers more; what was learned and written before stays as it is."""
+    """Also with one whose optimizer remembers more; what was learned and written before stays as it is."""
     run = copy_until(whole, tmp_path / "run", 9)
     done = call("train", f"resume={run}", "trials=4", "search.steps=3", "search.starts=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

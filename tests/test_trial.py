@@ -31,7 +31,7 @@ class Watched:
             policy=policy._replace(apply=self.act),
         )
         self.init, self.collect = jax.jit(self.exp.init), jax.jit(self.exp.collect)
-        self.absorb, self.fit = jax.jit(self.exp.absorb), jax.jit(self.exp.fit)
+        self.add_episode, self.fit = jax.jit(self.exp.add_episode), jax.jit(self.exp.fit)
         self.search, self.succeed = jax.jit(self.exp.search), jax.jit(self.exp.succeed)
         self.episodes = unchecked(jax.jit(jax.vmap(self.exp.episode, (0, None, None))))
 
@@ -50,7 +50,7 @@ def loop(watched, seed):
     states, infos, traces = [state], [], []
     for _ in range(TRIALS):
         trajectory = watched.collect(state)
-        state = watched.absorb(state, trajectory)
+        state = watched.add_episode(state, trajectory)
         state, fitted = watched.fit(state)
         incumbent = state.policy.params
         state, searched = watched.search(state)
@@ -81,7 +81,7 @@ def test_nothing_is_traced_again_from_trial_to_trial(looped):
 
 
 def test_a_study_of_many_seeds_as_one_program_is_the_loops_one_by_one(watched, looped):
-    """`improve` is search after fit, `trial` is collect, absorb, improve, and `run` a scan of so many trials."""
+    """`improve` is search after fit, `trial` is collect, add_episode, improve, and `run` a scan of so many trials."""
     study = unchecked(jax.jit(jax.vmap(run(watched.exp, TRIALS, EPISODES))))
     final, info = study(jnp.stack([jax.random.key(5), jax.random.key(6)]))
     for i, (states, infos, _) in enumerate((looped, loop(watched, 6))):
@@ -104,15 +104,15 @@ def test_every_episode_becomes_data_once_and_evaluations_never(looped):
 
 
 def test_the_seams_keep_to_their_part_of_the_state(watched, looped):
-    """collect changes nothing, absorb the data, fit the model, search the policy."""
+    """collect changes nothing, add_episode the data, fit the model, search the policy."""
     before = looped[0][1]
-    absorbed = watched.absorb(before, watched.collect(before))
-    fitted, _ = watched.fit(absorbed)
+    added = watched.add_episode(before, watched.collect(before))
+    fitted, _ = watched.fit(added)
     searched, _ = watched.search(fitted)
     parts = ("key", "data", "model", "policy", "trial")
     changes = [
         {part for part in parts if not same(getattr(a, part), getattr(b, part))}
-        for a, b in ((before, absorbed), (absorbed, fitted), (fitted, searched))
+        for a, b in ((before, added), (added, fitted), (fitted, searched))
     ]
     assert changes == [{"data", "trial"}, {"model"}, {"policy"}]
 
@@ -122,7 +122,7 @@ def test_a_trial_is_a_function_of_state_alone(watched, looped):
     states, infos, _ = looped
     trajectory = watched.collect(states[2])
     assert same(trajectory, infos[2].trajectory)
-    state, fitted = watched.fit(watched.absorb(states[2], trajectory))
+    state, fitted = watched.fit(watched.add_episode(states[2], trajectory))
     incumbent = state.policy.params
     state, searched = watched.search(state)
     state, _ = watched.succeed(state, incumbent)
@@ -132,7 +132,7 @@ def test_a_trial_is_a_function_of_state_alone(watched, looped):
 
 def test_a_search_in_pieces_is_the_search(watched, looped):
     """Also where it forgets Adam's moments, which only its first piece may do."""
-    fitted, _ = watched.fit(watched.absorb(looped[0][1], watched.collect(looped[0][1])))
+    fitted, _ = watched.fit(watched.add_episode(looped[0][1], watched.collect(looped[0][1])))
     whole, info = watched.search(fitted)
     part = jax.jit(partial(watched.exp.search, steps=3))
     middle, first = part(fitted, 0)
@@ -168,8 +168,8 @@ def test_evaluation_never_explores(watched, looped):
 
 
 def test_forgetting_adams_moments_or_not(watched, looped):
-    """fit warm-starts its optimiser, search does not, and can be told otherwise."""
-    state = watched.absorb(looped[0][2], watched.collect(looped[0][2]))
+    """fit warm-starts its optimizer, search does not, and can be told otherwise."""
+    state = watched.add_episode(looped[0][2], watched.collect(looped[0][2]))
     fresh = watched.init(jax.random.key(0))
     forgot = state._replace(
         model=state.model._replace(optimizer=fresh.model.optimizer),
@@ -286,8 +286,8 @@ def test_a_search_starts_from_the_better_of_the_old_policy_and_a_fresh_one(offse
         apply=lambda params, noise, x: params["aim"][:1] - x[:1],
     )
     jump = regression(2, 1)._replace(
-        sample=lambda key, belief: (),
-        apply=lambda belief, draw, x, u: Prediction(jnp.broadcast_to(u, (2,)), jnp.zeros(2)),
+        sample=lambda key, posterior: (),
+        apply=lambda posterior, draw, x, u: Prediction(jnp.broadcast_to(u, (2,)), jnp.zeros(2)),
     )
     config = tiny(search__steps=1, search__learning_rate=1e-12, search__match=False)
     exp = compose(config, task, dynamics=jump, policy=towards)
@@ -310,7 +310,7 @@ def test_random_episodes_come_before_any_learning():
     unknown = [True, False, False]
     assert np.isnan(info.fit.loss).tolist() == np.isnan(info.search.objective).all(1).tolist() == unknown
     assert info.search.skipped.tolist() == [0, 0, 0]
-    again = jax.jit(lambda s: exp.improve(exp.absorb(s, exp.collect(s)))[0])
+    again = jax.jit(lambda s: exp.improve(exp.add_episode(s, exp.collect(s)))[0])
     kept = again(first)
     assert same((kept.model, kept.policy), (first.model, first.policy))
     learned = again(kept)
@@ -344,18 +344,18 @@ def test_a_successor_takes_over_where_it_is_expected_to_cost_less(better, compar
 
 def test_an_episode_that_is_none_of_the_tasks_is_refused(watched, looped):
     state, trajectory = looped[0][0], looped[1][0].trajectory
-    absorb = watched.exp.absorb
+    add_episode = watched.exp.add_episode
     with pytest.raises(ValueError, match=r"x has shape \(9, 3\); expected \(9, 2\)"):
-        absorb(state, trajectory._replace(x=jnp.zeros((9, 3))))
+        add_episode(state, trajectory._replace(x=jnp.zeros((9, 3))))
     with pytest.raises(ValueError, match=r"cost has shape \(7,\); expected \(8,\)"):
-        jax.jit(absorb)(state, trajectory._replace(cost=jnp.zeros(7)))
+        jax.jit(add_episode)(state, trajectory._replace(cost=jnp.zeros(7)))
     with pytest.raises(ValueError, match=r"u\[3, 0\] is nan"):
-        absorb(state, trajectory._replace(u=trajectory.u.at[3, 0].set(jnp.nan)))
-    absorb(state, trajectory._replace(u=trajectory.u.at[3, 0].set(jnp.nan), length=jnp.int32(3)))
+        add_episode(state, trajectory._replace(u=trajectory.u.at[3, 0].set(jnp.nan)))
+    add_episode(state, trajectory._replace(u=trajectory.u.at[3, 0].set(jnp.nan), length=jnp.int32(3)))
     full = looped[0][TRIALS]
     with pytest.raises(ValueError, match="an episode of 8 rows does not fit: 0 are left"):
-        absorb(full, trajectory)
-    kept = watched.absorb(full, trajectory)  # inside jit nobody can be told, and nothing is lost
+        add_episode(full, trajectory)
+    kept = watched.add_episode(full, trajectory)  # inside jit nobody can be told, and nothing is lost
     assert same(kept.data, full.data)
 
 
@@ -366,7 +366,7 @@ def test_an_episode_that_ends_early_teaches_its_own_rows(watched, looped):
         trajectory._replace(x=trajectory.x.at[6:].set(rows), u=trajectory.u.at[5:].set(rows), length=jnp.int32(5))
         for rows in (0.0, 7.0)
     )
-    once, again = (watched.absorb(state, episode).data for episode in (short, other))
+    once, again = (watched.add_episode(state, episode).data for episode in (short, other))
     assert same(once, again)
     assert int(once.size) == 8 + 5
     assert np.array_equal(once.x[8:13], trajectory.x[:5])

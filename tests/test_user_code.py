@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.tasks import user_code
 
 
@@ -22,7 +22,7 @@ def here(tmp_path, monkeypatch):
 
 
 def refusal(name, **options):
-    with pytest.raises(SettingError) as caught:
+    with pytest.raises(ConfigError) as caught:
         user_code.load("cost", name, **options)
     message = str(caught.value)
     assert "\n" not in message
@@ -108,7 +108,7 @@ def test_a_module_outside_the_runs_folder_is_imported(here):
 def test_what_a_function_raises_has_its_line_or_that_of_its_definition(here):
     (here / "called.py").write_text("\ndef two(x, u):\n    return x\n\ndef fails(x):\n    return len(3)\n")
     two, fails = (user_code.load("cost", f"called:{name}") for name in ("two", "fails"))
-    with pytest.raises(SettingError, match=r"^it: TypeError: .* no len\(\) \(called.py:6\)$"), user_code.blamed("it"):
+    with pytest.raises(ConfigError, match=r"^it: TypeError: .* no len\(\) \(called.py:6\)$"), user_code.blamed("it"):
         fails(1)
     assert user_code.told(TypeError("no u"), two) == "TypeError: no u (called.py:2)"
     assert user_code.told(TypeError("no u"), len) == "TypeError: no u"

@@ -49,9 +49,9 @@ def layers_of(network: Any) -> plain_torch.Layers:
 
 def problem_of(work: Workload) -> plain_torch.Problem:
     """The same search step for PyTorch."""
-    task, scaling = work.task, work.belief.scaling
+    task, scaling = work.task, work.posterior.scaling
     return plain_torch.Problem(
-        model=layers_of(work.belief.network),
+        model=layers_of(work.posterior.network),
         masks=[tensor(mask) for mask in work.scenarios.dynamics[1:]],
         centre=tensor(scaling.inputs.mean),
         target_scale=tensor(jnp.diagonal(scaling.targets.root)),
@@ -79,7 +79,7 @@ def disagreement(work: Workload, problem: plain_torch.Problem, one: Callable) ->
     policy = [(kernel.requires_grad_(), bias.requires_grad_()) for kernel, bias in layers_of(network)]
     theirs = plain_torch.objective(problem, policy, draws, one)
     theirs.backward()
-    ours, gradient = jax.jit(jax.value_and_grad(work.objective))(work.state.policy.params, work.belief, given)
+    ours, gradient = jax.jit(jax.value_and_grad(work.objective))(work.state.policy.params, work.posterior, given)
     pairs = zip(layers_of(gradient["network"]), policy, strict=True)
     flat = [(a.numpy(), b.grad.numpy()) for pair in pairs for a, b in zip(*pair, strict=True)]
     difference, size = (np.sqrt(sum(np.sum(f(a, b) ** 2) for a, b in flat)) for f in (np.subtract, lambda a, _: a))

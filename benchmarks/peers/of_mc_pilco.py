@@ -39,7 +39,7 @@ from torch import Tensor
 from benchmarks.suite import widened
 from benchmarks.workloads import EPISODES, Workload, goal, workload
 from pegasus_jax.pilco import kernels
-from pegasus_jax.pilco.gp import Belief
+from pegasus_jax.pilco.gp import Posterior
 from pegasus_jax.pilco.kernels import inputs_of
 from pegasus_jax.pilco.rbf import regress
 from pegasus_jax.types import Array, Params, Task
@@ -76,7 +76,7 @@ def comparable(words: dict[str, str], horizon: int | None = None) -> Workload:
     gradient right.
     """
     work = workload(words, horizon)
-    params = kernels.start(len(work.task.state_names), work.belief.x.shape[1])
+    params = kernels.start(len(work.task.state_names), work.posterior.x.shape[1])
     params |= {"log_lengthscale": params["log_lengthscale"] + np.log(4)}
     return of_the_mean(work._replace(state=work.state._replace(model=work.state.model._replace(params=params))))
 
@@ -88,12 +88,14 @@ def in_double(work: Workload) -> Workload:
 
 
 def of_the_mean(work: Workload) -> Workload:
-    """The workload with the belief of its model, whose mean is the function of every particle, and no sensor noise."""
-    belief = jax.jit(work.experiment.dynamics.condition)(work.state.model.params, work.state.data)
+    """The workload with its model's posterior mean as the function of every particle, and no sensor noise."""
+    posterior = jax.jit(work.experiment.dynamics.posterior)(work.state.model.params, work.state.data)
     draws, sensor = work.scenarios.dynamics, work.scenarios.sensor
-    correction = jnp.broadcast_to(belief.beta, draws.correction.shape)
+    correction = jnp.broadcast_to(posterior.beta, draws.correction.shape)
     mean = draws._replace(weights=jnp.zeros_like(draws.weights), correction=correction)
-    return work._replace(belief=belief, scenarios=work.scenarios._replace(dynamics=mean, sensor=jnp.zeros_like(sensor)))
+    return work._replace(
+        posterior=posterior, scenarios=work.scenarios._replace(dynamics=mean, sensor=jnp.zeros_like(sensor))
+    )
 
 
 def tensor(array: Any) -> Tensor:
@@ -131,9 +133,9 @@ def of_policy(params: Params, task: Task) -> dict[str, Array]:
     }
 
 
-def of_processes(belief: Belief) -> list[dict[str, Any]]:
+def of_processes(posterior: Posterior) -> list[dict[str, Any]]:
     """The settings of its processes, in raw units and of exp(-d^2 / l^2), that make them ours."""
-    h, (inputs, targets) = jax.tree.map(np.asarray, (belief.hyper, belief.scaling))
+    h, (inputs, targets) = jax.tree.map(np.asarray, (posterior.hyper, posterior.scaling))
     scale = np.diagonal(targets.root)
     columns = {
         "lengthscales_init": 2**0.5 * h.lengthscale * np.diagonal(inputs.root),
@@ -154,7 +156,7 @@ def program(package: Any, work: Workload, policy: dict[str, Array]) -> Any:
         raise ValueError(f"task={task.name} has {u.shape[1]} controls; MC-PILCO's policy is ours for 1 only")
     plain, angles = dimensions(task)
     sizes = {"state_dim": x.shape[1], "input_dim": u.shape[1]}
-    of_model = dict(num_gp=x.shape[1], init_dict_list=of_processes(work.belief))
+    of_model = dict(num_gp=x.shape[1], init_dict_list=of_processes(work.posterior))
     of_control = dict(num_basis=len(policy["centers"]), flg_squash=True, u_max=float(task.control_high[0]))
     arrays = dict(angle_indices=np.asarray(angles), non_angle_indices=np.asarray(plain))
     with contextlib.redirect_stdout(io.StringIO()):
@@ -197,12 +199,12 @@ def start(mean: Tensor, std: Tensor, particles: int) -> dict[str, Any]:
 def disagreement(package: Any, work: Workload) -> dict[str, float]:
     """How far its objective and gradient are from ours, and its standard deviations of the first step, both relative
     but the objective. Of a workload `in_double`, where JAX has that."""
-    task, params, belief = work.task, work.state.policy.params, work.belief
+    task, params, posterior = work.task, work.state.policy.params, work.posterior
     x = work.scenarios.start
-    ours, gradient = jax.jit(jax.value_and_grad(work.objective))(params, belief, work.scenarios)
+    ours, gradient = jax.jit(jax.value_and_grad(work.objective))(params, posterior, work.scenarios)
     inputs = inputs_of(x, jax.vmap(work.experiment.policy.apply, (None, None, 0))(params, None, x), task.angles)
     moments: Any = work.experiment.dynamics.moments  # a Gaussian process has them
-    image = jax.vmap(moments, (None, 0, None))(belief, inputs, jnp.zeros((inputs.shape[1],) * 2))
+    image = jax.vmap(moments, (None, 0, None))(posterior, inputs, jnp.zeros((inputs.shape[1],) * 2))
 
     policy, back = jax.vjp(partial(of_policy, task=task), params)
     theirs = program(package, work, policy)

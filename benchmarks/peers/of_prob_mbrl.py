@@ -6,7 +6,7 @@ Python or its PyTorch still had (`collections.Iterable`, `torch.cholesky`) is pu
 
 Its rollout and ours are one computation except for where noise and cost enter, so the states are compared, of the same
 weights, masks and draws: its model's noise moves the state where ours blurs what the policy sees (both are 0 in the
-comparison), it standardises the draws of the moment matching and rolls them over the particles from step to step (given
+comparison), it standardizes the draws of the moment matching and rolls them over the particles from step to step (given
 to ours in that form), and it takes the cost before the moment matching (both objectives here are of the states after).
 """
 
@@ -98,7 +98,7 @@ def agents(package: Any, work: Workload, layers_of: Callable[[Any], Layers], ten
     # Its encoded input is (plain states, controls, sines, cosines), ours (plain states, sines, cosines, controls).
     plain = states - len(angles)
     order = [*range(plain), *range(work.features, work.features + controls), *range(plain, work.features)]
-    layers = layers_of(work.belief.network)
+    layers = layers_of(work.posterior.network)
     layers[0] = (layers[0][0][order], layers[0][1])
     nonlinear = {"silu": package.models.Swish, "relu": torch.nn.ReLU, "tanh": torch.nn.Tanh}
 
@@ -114,7 +114,7 @@ def agents(package: Any, work: Workload, layers_of: Callable[[Any], Layers], ten
         reward_func=of_goal(work, tensor),
         output_density=package.models.DiagGaussianDensity(states),
     ).float()
-    dynamics.mx.data = tensor(work.belief.scaling.inputs.mean)[order][None]
+    dynamics.mx.data = tensor(work.posterior.scaling.inputs.mean)[order][None]
     for name in ("iSx", "Sy"):
         getattr(dynamics, name).data = torch.ones(1, 1)
     dynamics.output_density.z.data = torch.zeros(work.config.search.particles, states)
@@ -146,7 +146,7 @@ def disagreement(package: Any, work: Workload, layers_of: Callable[[Any], Layers
         cost=cost.of_particles(task.cost),
         noise=NoiseUse(policy=0.0),
     )
-    ours, gradient = jax.jit(jax.value_and_grad(value))(work.state.policy.params, work.belief, given)
+    ours, gradient = jax.jit(jax.value_and_grad(value))(work.state.policy.params, work.posterior, given)
     dynamics, policy = agents(package, work, layers_of, tensor)
     dynamics.eval()
     states, _, _ = package.utils.rollout(

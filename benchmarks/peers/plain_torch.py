@@ -16,7 +16,7 @@ Layers = list[tuple[Tensor, Tensor]]  # (kernel [inputs, outputs], bias [outputs
 class Problem(NamedTuple):
     """Everything about a search step but the policy and the noise."""
 
-    model: Layers  # centred inputs -> change of state, raw noise std
+    model: Layers  # centered inputs -> change of state, raw noise std
     masks: list[Tensor]  # [K, width] of each hidden layer: one draw of the model a particle
     centre: Tensor  # [F + U] mean of the model's inputs
     target_scale: Tensor  # [D]
@@ -85,8 +85,8 @@ def step(
         blur = (0.1 * torch.sigmoid(raw) + 1e-6) * problem.target_scale * sensor
     if problem.match:
         mean = x.mean(0)
-        centred = x - mean
-        x = mean + redraw @ torch.linalg.cholesky_ex(centred.T @ centred / (len(x) - 1))[0].T
+        centered = x - mean
+        x = mean + redraw @ torch.linalg.cholesky_ex(centered.T @ centered / (len(x) - 1))[0].T
     error = encode(problem, x) - problem.goal
     return x, blur, 1 - torch.exp(-0.5 * (error * error).mean(1)).mean()
 

@@ -77,7 +77,7 @@ class PlantEnv(gymnasium.Env):
         return self._sensed(x), -cost, False, self._time >= self._horizon, {"x": x, "cost": cost}
 
     def render(self):
-        """A picture [height, width, 3] of 8-bit colours, or None without a render mode."""
+        """A picture [height, width, 3] of 8-bit colors, or None without a render mode."""
         if self.render_mode is None:
             return None
         if self._state is None:

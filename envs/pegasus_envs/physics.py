@@ -51,7 +51,7 @@ Change = tuple[str, Any, Any]
 """a field of MuJoCo's model, an index into it, the value to put there"""
 
 Accelerate = Callable[[Array, Array, Array], Array]
-"""(positions [nq, ...], velocities [nv, ...], actuator commands [nu, ...]) -> generalised acceleration [nv, ...]"""
+"""(positions [nq, ...], velocities [nv, ...], actuator commands [nu, ...]) -> generalized acceleration [nv, ...]"""
 
 _Stage = tuple[Array, Array, Array, Array]
 """velocity and acceleration of the last stage, their weighted means so far: each [nv]"""
@@ -148,7 +148,7 @@ def acceleration(physics: Physics, qpos: Array, qvel: Array, control: Array) -> 
 
 
 def displace(qpos: Array, velocity: Array, time: Array | float) -> Array:
-    """Positions [nq, ...] after moving with a constant generalised velocity [nv, ...] for a time [s].
+    """Positions [nq, ...] after moving with a constant generalized velocity [nv, ...] for a time [s].
 
     The free joint, where there is one, comes first: a position, then a quaternion that turns in the body's frame.
     """

@@ -49,7 +49,7 @@ class Plant(NamedTuple):
     model: Any
     """mujoco.MjModel on the host, to render and to compare; has the default constants where those given are traced"""
     qpos: Callable[[State], Array]
-    """state -> MuJoCo's generalised positions [nq]"""
+    """state -> MuJoCo's generalized positions [nq]"""
     rates: tuple[int, ...] = ()
     """the entries of x that are rates of its other entries, in the order of those; (): x is not made of such pairs"""
 

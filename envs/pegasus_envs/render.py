@@ -80,7 +80,7 @@ class Renderer:
             self._camera.type, self._camera.fixedcamid = mujoco.mjtCamera.mjCAMERA_FIXED, 0
 
     def __call__(self, state: Any) -> np.ndarray:
-        """A picture [height, width, 3] of 8-bit colours."""
+        """A picture [height, width, 3] of 8-bit colors."""
         width, height = self._size
         self._data.qpos[:] = np.asarray(self._qpos(state))
         mujoco.mj_forward(self._model, self._data)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pegasus_jax import config, tasks
     from pegasus_jax.builder import build, compose, dynamics_of, policy_of
-    from pegasus_jax.checks import RunError, SettingError
+    from pegasus_jax.checks import ConfigError, RunError
     from pegasus_jax.config import Config
     from pegasus_jax.experiment import TrialInfo, run, trial
     from pegasus_jax.imagine import costs, matching
@@ -72,7 +72,7 @@ _NAMES = {
     "presets": "preset",
     "builder": "build compose dynamics_of policy_of",
     "experiment": "run trial TrialInfo",
-    "checks": "SettingError RunError",
+    "checks": "ConfigError RunError",
     "runs.controller": "controller Controller",
     # the method, function by function
     "imagine.scenarios": "blocks Blocks draw",
@@ -112,6 +112,7 @@ __all__ = [
     "Batch",
     "Blocks",
     "Config",
+    "ConfigError",
     "Controller",
     "Cost",
     "Dataset",
@@ -136,7 +137,6 @@ __all__ = [
     "SearchState",
     "SearchTable",
     "Searcher",
-    "SettingError",
     "Successor",
     "Task",
     "Trajectory",

@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 
 from pegasus_jax import config as settings
 from pegasus_jax import episode, tasks
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import experiment
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching, scenarios
@@ -86,7 +86,7 @@ def compose(
     """The experiment of a config on any task, with pieces of your own in place of the configured or the task's ones.
 
     A `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
-    With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises SettingError where a piece
+    With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
     does not suit the config: a cost without a width, for example, needs `search.widen=1`.
     """
     task = task if cost is None else with_cost(task, cost)
@@ -112,9 +112,9 @@ def compose(
 
 
 def with_cost(task: Task, cost: Cost) -> Task:
-    """The task with another cost. Raises SettingError for a bare function."""
+    """The task with another cost. Raises ConfigError for a bare function."""
     if not isinstance(cost, Cost):
-        raise SettingError(f"cost={cost!r} is no Cost; a function of one state x [D] makes one: Cost(function)")
+        raise ConfigError(f"cost={cost!r} is no Cost; a function of one state x [D] makes one: Cost(function)")
     return task._replace(cost=cost.of_state, expected_cost=cost.expected, widened=cost.widen)
 
 
@@ -141,7 +141,9 @@ def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
     return minibatches(dynamics, optax.adam(rate), batch=config.batch)
 
 
-Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]  # (key, policy parameters, belief) -> cost [H, K] too
+Imagine = Callable[
+    [Key, Params, Params], tuple[Rollout, Array]
+]  # (key, policy parameters, posterior) -> cost [H, K] too
 
 
 def search_of(
@@ -159,7 +161,7 @@ def search_of(
         return analytic_search_of(search, task, dynamics, policy, aggregate, noise)
     if (search.match or search.balanced) and search.particles <= len(task.state_names):
         states, what = len(task.state_names), "moment matching" if search.match else "balanced draws"
-        raise SettingError(
+        raise ConfigError(
             f"search.particles={search.particles} is too few: {what} of {states} dimensions needs at least {states + 1}"
         )
     blocks = blocks_of(search.particles, task, dynamics, policy, balanced=search.balanced, spread=spread)
@@ -172,11 +174,11 @@ def search_of(
     # What no row asks for is not compiled.
     refines, widens = table.refine.any(), (table.cost_width != 1).any()
 
-    def value(params: Params, belief: Params, given: Scenarios, row: SearchTable) -> Array:
+    def value(params: Params, posterior: Params, given: Scenarios, row: SearchTable) -> Array:
         refining = row.refine if refines else None
         return objective(
             params,
-            belief,
+            posterior,
             given,
             **pieces,
             aggregate=aggregate,
@@ -222,27 +224,27 @@ def analytic_search_of(
     aggregate: cost.Aggregate,
     noise: NoiseUse,
 ) -> tuple[Searcher, Imagine]:
-    """PILCO's search. Raises SettingError where a piece has no moments."""
+    """PILCO's search. Raises ConfigError where a piece has no moments."""
     if task.stop is not None:
-        raise SettingError("algorithm=pilco propagates a Gaussian, which cannot stop; leave out stop=")
+        raise ConfigError("algorithm=pilco propagates a Gaussian, which cannot stop; leave out stop=")
     if dynamics.moments is None:
-        raise SettingError("algorithm=pilco needs a model with analytic moments: model=ssgp, model=gp")
+        raise ConfigError("algorithm=pilco needs a model with analytic moments: model=ssgp, model=gp")
     if policy.moments is None:
-        raise SettingError(
+        raise ConfigError(
             "algorithm=pilco needs a policy with analytic moments, saturated by sines: policy=rbf, policy=linear"
         )
     mean, std = jnp.asarray(task.start_mean, float), jnp.asarray(task.start_std, float)
     low, high = limits(task)
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy)
 
-    def noise_std(key: Key, belief: Params) -> Array:
+    def noise_std(key: Key, posterior: Params) -> Array:
         middle = (low + high) / 2
-        return dynamics.apply(belief, dynamics.sample(key, belief), mean, middle).std
+        return dynamics.apply(posterior, dynamics.sample(key, posterior), mean, middle).std
 
-    def value(params: Params, belief: Params, std: Array) -> Array:
+    def value(params: Params, posterior: Params, std: Array) -> Array:
         return pilco.objective(
             params,
-            belief,
+            posterior,
             begin,
             std,
             **pieces,
@@ -262,10 +264,10 @@ def analytic_search_of(
 def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Array | None], Callable[[Array], Array]]:
     """(whether this refines, a factor of the cost's width; None: never) -> costs [H, K] or [H, 1] of states [H, K, D].
 
-    Raises SettingError where the task's cost has no width.
+    Raises ConfigError where the task's cost has no width.
     """
     if search.widen > 1 and task.widened is None:
-        raise SettingError(
+        raise ConfigError(
             f"search.widen={search.widen:g} needs a cost with a width, which that of task={task.name} lacks;"
             " the nearest is 1"
         )
@@ -319,14 +321,14 @@ def blocks_of(
 def imagined(
     key: Key,
     params: Params,
-    belief: Params,
+    posterior: Params,
     *,
     blocks: scenarios.Blocks,
     task: Task,
     **pieces: Any,
 ) -> tuple[Rollout, Array]:
     """Rollouts under fresh scenarios and the cost of every particle [H, K]."""
-    rolled = rollout(params, belief, scenarios.draw(key, 0, belief, blocks=blocks, period=Period()), **pieces)
+    rolled = rollout(params, posterior, scenarios.draw(key, 0, posterior, blocks=blocks, period=Period()), **pieces)
     return rolled, until_stop(task, of_particles(task.cost))(rolled.x[1:])
 
 
@@ -337,7 +339,7 @@ def start(key: Key, *, task: Task) -> Array:
 
 
 def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
-    """The configured model of a task's dynamics. Raises SettingError where the task does not suit it."""
+    """The configured model of a task's dynamics. Raises ConfigError where the task does not suit it."""
     shape: dict[str, Any] = dict(states=len(task.state_names), controls=len(task.control_names), angles=task.angles)
     match config:
         case settings.GP():
@@ -365,11 +367,11 @@ def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
 
 
 def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
-    """The configured noise on a model's units. Raises SettingError for parameters it cannot have."""
+    """The configured noise on a model's units. Raises ConfigError for parameters it cannot have."""
     try:
         return NOISES[config.dropout](config)
     except ValueError as error:
-        raise SettingError(f"model.dropout={config.dropout}: {error}") from error
+        raise ConfigError(f"model.dropout={config.dropout}: {error}") from error
 
 
 def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task) -> Policy:

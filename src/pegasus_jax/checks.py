@@ -27,7 +27,7 @@ SIZES = {
 }
 
 
-class SettingError(ValueError):
+class ConfigError(ValueError):
     """A setting that cannot be; the message is one line for the person who set it."""
 
 
@@ -44,15 +44,15 @@ def nearest(name: str, choices: Iterable[str]) -> str:
 
 
 def choice(name: str, value: Any, choices: Iterable[Any]) -> None:
-    """Raises SettingError unless the value is one of the choices."""
+    """Raises ConfigError unless the value is one of the choices."""
     if value not in tuple(choices):
-        raise SettingError(f"{name}={value} is not a choice; {nearest(value, choices)}")
+        raise ConfigError(f"{name}={value} is not a choice; {nearest(value, choices)}")
 
 
 def within(
     name: str, value: float, low: float, high: float = math.inf, *, open_low: bool = False, open_high: bool = False
 ) -> None:
-    """Raises SettingError unless the value is finite and from low to high, an end that is open left out."""
+    """Raises ConfigError unless the value is finite and from low to high, an end that is open left out."""
     outside = value < low or value > high or (open_low and value == low) or (open_high and value == high)
     if outside or not math.isfinite(value):
         left, right = "(" if open_low or low == -math.inf else "[", ")" if open_high or high == math.inf else "]"
@@ -60,11 +60,11 @@ def within(
         open_end = open_high if value >= high else open_low
         nearest_value = min(max(value, low), high) if math.isfinite(value) and not open_end else None
         hint = f"; the nearest is {number(nearest_value)}" if nearest_value is not None else ""
-        raise SettingError(f"{name}={number(value)} is out of range; expected a number in {interval}{hint}")
+        raise ConfigError(f"{name}={number(value)} is out of range; expected a number in {interval}{hint}")
 
 
 def least(section: str, config: Any, low: float, *names: str) -> None:
-    """Raises SettingError unless each of these settings of a section is at least `low`."""
+    """Raises ConfigError unless each of these settings of a section is at least `low`."""
     for name in names:
         within(f"{section}.{name}", getattr(config, name), low)
 
@@ -75,7 +75,7 @@ def number(value: float) -> str:
 
 
 def size(name: str, value: int, low: int = 1) -> None:
-    """Raises SettingError unless a size, the last part of the setting's name in SIZES, is at least `low` and sane."""
+    """Raises ConfigError unless a size, the last part of the setting's name in SIZES, is at least `low` and sane."""
     within(name, value, low, SIZES[name.rpartition(".")[2]])
 
 
@@ -86,48 +86,48 @@ def sizes(section: str, config: Any, *names: str, low: int = 1) -> None:
 
 
 def rows(trials: int, horizon: int | None) -> None:
-    """Raises SettingError where episodes make more data than SIZES allows."""
+    """Raises ConfigError where episodes make more data than SIZES allows."""
     most = SIZES["rows"]
     if trials * (horizon or 1) > most:
-        raise SettingError(
+        raise ConfigError(
             f"trials={trials} of horizon={horizon} are more than {most:,} rows of data;"
             f" the nearest is trials={most // (horizon or 1)}"
         )
 
 
 def layers(name: str, widths: tuple[int, ...]) -> None:
-    """Raises SettingError unless these are widths of hidden layers."""
+    """Raises ConfigError unless these are widths of hidden layers."""
     for width in widths:
         within(name, width, 1, SIZES["hidden"])
     within(f"number of {name}", len(widths), 0, 100)
 
 
 def finite(name: str, values: Iterable[float]) -> None:
-    """Raises SettingError unless each of these is a finite number."""
+    """Raises ConfigError unless each of these is a finite number."""
     for value in values:
         if not math.isfinite(value):
-            raise SettingError(f"{name}={value} is not a finite number")
+            raise ConfigError(f"{name}={value} is not a finite number")
 
 
 def different(name: str, values: tuple[Any, ...]) -> None:
-    """Raises SettingError where one of these is there twice."""
+    """Raises ConfigError where one of these is there twice."""
     for value in values:
         if values.count(value) > 1:
             once = ",".join(map(str, dict.fromkeys(values)))
-            raise SettingError(f"{name}=[{','.join(map(str, values))}] names {value} twice; the nearest is [{once}]")
+            raise ConfigError(f"{name}=[{','.join(map(str, values))}] names {value} twice; the nearest is [{once}]")
 
 
 def typed(section: str, node: Any) -> None:
     """Makes each field of a config dataclass the type that it is declared as; lists become tuples.
 
-    Raises SettingError where it is of another type, in one line that names the setting and its default.
+    Raises ConfigError where it is of another type, in one line that names the setting and its default.
     """
     for f in dataclasses.fields(node):
         given = getattr(node, f.name)
         value = _as(f.type, given)
         if value is _WRONG:
             name = f"{section}.{f.name}" if section else f.name
-            raise SettingError(f"{name}={shown(given)} is not {called(f.type)}; for example {name}={shown(f.default)}")
+            raise ConfigError(f"{name}={shown(given)} is not {called(f.type)}; for example {name}={shown(f.default)}")
         object.__setattr__(node, f.name, value)
 
 
@@ -178,14 +178,14 @@ def shown(value: Any) -> str:
 def kind(section: str, value: str, kind: str) -> None:
     """A section's kind says which class it is; a variant changes it, never a single setting."""
     if value != kind:
-        raise SettingError(
+        raise ConfigError(
             f"{section}.kind={value} cannot be set: model=, policy= and algorithm= choose what {section} is"
         )
 
 
 def whole(name: str, text: str) -> int:
-    """The whole number of an option. Raises SettingError when it is none, or 0 where nothing would be done."""
+    """The whole number of an option. Raises ConfigError when it is none, or 0 where nothing would be done."""
     if not text.isdecimal() or (name in ("episodes", "seeds", "jobs") and int(text) < 1):
-        raise SettingError(f"{name}={text} is not a whole number; for example {name}=20")
+        raise ConfigError(f"{name}={text} is not a whole number; for example {name}=20")
     within(name, int(text), 0, 2**32 - 1 if name == "seed" else SIZES["trials"])
     return int(text)

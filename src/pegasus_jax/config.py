@@ -1,6 +1,6 @@
 """Every setting, typed, with its default and its limits. Frozen and hashable: a config is a key.
 
-Values are checked when a config is made; a bad one raises `SettingError`, which names it and what was expected.
+Values are checked when a config is made; a bad one raises `ConfigError`, which names it and what was expected.
 """
 
 import dataclasses
@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 from pegasus_jax import checks
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config_models import BNN, GP, INITIALISERS, SSGP, Lagrangian, setting
 
-MANOEUVRES = ("knife_edge", "belly_up", "corkscrew", "depth_change")
+MANEUVERS = ("knife_edge", "belly_up", "corkscrew", "depth_change")
 GYM = "gym"  # the task that `env=` and `cost=` describe
 MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe
-TASKS = ("cartpole", "double_cartpole", *(f"swimmer_{manoeuvre}" for manoeuvre in MANOEUVRES), GYM, MJCF)
+TASKS = ("cartpole", "double_cartpole", *(f"swimmer_{maneuver}" for maneuver in MANEUVERS), GYM, MJCF)
 OWN = (GYM, MJCF)
 
 SQUASHES = ("tanh", "sine")
@@ -188,20 +188,20 @@ class Search:
             if value is not None:
                 checks.within(f"search.{name}", value, 0, open_low=True)
         if self.reheat and (self.anneal == 1 or self.decay == 1):
-            raise SettingError(
+            raise ConfigError(
                 f"search.reheat={self.reheat:g} needs searches that cool, search.anneal=10 search.decay=0.1;"
                 " the nearest is 0"
             )
         if self.loosen > 1 and (self.limit is None or not self.reheat):
-            raise SettingError(
+            raise ConfigError(
                 f"search.loosen={self.loosen:g} needs search.limit=1 search.reheat=0.3, or the like; the nearest is 1"
             )
         if self.anneal > 1 and self.refine:
-            raise SettingError(f"search.anneal={self.anneal} needs search.refine=0")
+            raise ConfigError(f"search.anneal={self.anneal} needs search.refine=0")
         if self.anew and not (self.restart and self.refine):
-            raise SettingError("search.anew=true needs search.restart=true search.refine=0.5; the nearest is false")
+            raise ConfigError("search.anew=true needs search.restart=true search.refine=0.5; the nearest is false")
         if self.starts > 1 and not self.reset:
-            raise SettingError(f"search.starts={self.starts} begins every search anew; it needs search.reset=true")
+            raise ConfigError(f"search.starts={self.starts} begins every search anew; it needs search.reset=true")
 
 
 @dataclass(frozen=True)

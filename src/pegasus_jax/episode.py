@@ -28,7 +28,7 @@ def watch(
 ) -> tuple[Trajectory, Any]:
     """`run`, and what `look(plant's state, u [U])` returned at the beginning of each control period [H, ...]."""
     if task.plant is None:
-        raise ValueError(f"task {task.name} has no plant in JAX; hand its episodes to absorb")
+        raise ValueError(f"task {task.name} has no plant in JAX; hand its episodes to add_episode")
     plant = task.plant
     begin, first, steps = jax.random.split(key, 3)
     sensor_std = jnp.asarray(task.sensor_std, float)

@@ -1,4 +1,4 @@
-"""The loop of Alg. 1 as three seams: collect (the plant), absorb (the data), improve (the mind)."""
+"""The loop of Alg. 1 as three seams: collect (the plant), add_episode (the data), improve (the mind)."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -69,8 +69,8 @@ def experiment(
 ) -> Experiment:
     """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned.
 
-    `imagine(key, policy parameters, belief)` rolls out fresh scenarios -> (rollout, cost [H, K]). With `compare` a new
-    policy takes the old one's place only where it is expected to cost less. With an environment instead of a plant in
+    `imagine(key, policy parameters, posterior)` rolls out fresh scenarios -> (rollout, cost [H, K]). With `compare` a
+    new policy takes the old one's place only where it is expected to cost less. With an environment instead of a plant in
     JAX, `episode` and `collect` are not pure, and `drive` is there.
     """
     states, controls = len(task.state_names), len(task.control_names)
@@ -141,7 +141,7 @@ def experiment(
 
     run_episode = one_episode if task.environment is None else driven
 
-    def absorb(state: RunState, trajectory: Trajectory) -> RunState:
+    def add_episode(state: RunState, trajectory: Trajectory) -> RunState:
         """The run with one more episode in its data (Alg. 1 line 4).
 
         Raises ValueError for arrays of other shapes, and, outside of jit, for numbers that are not finite and where
@@ -163,7 +163,7 @@ def experiment(
     ) -> tuple[RunState, SearchInfo]:
         """Improve the policy in imagination (Alg. 1 line 6), from iteration `first` of the trial's search."""
         key = trial_key(state.key, state.trial, SEARCH)
-        belief = dynamics.condition(state.model.params, state.data)
+        posterior = dynamics.posterior(state.model.params, state.data)
 
         explored = max(1, explore_trials)
         # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
@@ -174,7 +174,7 @@ def experiment(
         learner, info = search.run(
             key,
             state.policy._replace(params=given),
-            belief,
+            posterior,
             first=first,
             earlier=jnp.maximum(state.trial - explored, 0),
             steps=steps,
@@ -187,14 +187,14 @@ def experiment(
 
         Both are imagined on the same fresh scenarios under the new model.
         """
-        belief = dynamics.condition(state.model.params, state.data)
+        posterior = dynamics.posterior(state.model.params, state.data)
         key = trial_key(state.key, state.trial, IMAGINE)
-        rolled, cost = imagine(key, state.policy.params, belief)
+        rolled, cost = imagine(key, state.policy.params, posterior)
         if not compare:
             return state._replace(policy_trial=state.trial), Successor(
                 rolled, cost, jnp.full((), jnp.nan), jnp.bool_(True)
             )
-        old_rolled, old_cost = imagine(key, incumbent, belief)
+        old_rolled, old_cost = imagine(key, incumbent, posterior)
         old = jnp.mean(old_cost)
         replaced = (state.policy_trial == 0) | ~(old <= jnp.mean(cost))
         rolled, cost, params = optax.tree.where(
@@ -220,19 +220,19 @@ def experiment(
         state = succeed(state, incumbent)[0] if compare else state._replace(policy_trial=state.trial)
         return state, (fitted, searched)
 
-    def look_ahead(state: RunState) -> tuple[Rollout, Array]:
+    def simulate(state: RunState) -> tuple[Rollout, Array]:
         """Rollouts of the policy under scenarios the search has not seen, and their costs [H, K]."""
-        belief = dynamics.condition(state.model.params, state.data)
-        return imagine(trial_key(state.key, state.trial, IMAGINE), state.policy.params, belief)
+        posterior = dynamics.posterior(state.model.params, state.data)
+        return imagine(trial_key(state.key, state.trial, IMAGINE), state.policy.params, posterior)
 
     def calibrate(state: RunState, trajectory: Trajectory) -> Array:
-        """`calibration` of the model as it is, on the next episode before it is absorbed; NaN before the first fit.
+        """`calibration` of the model as it is, on the next episode before it is added; NaN before the first fit.
 
         With a key of its own, so that asking changes nothing.
         """
-        belief = dynamics.condition(state.model.params, state.data)
+        posterior = dynamics.posterior(state.model.params, state.data)
         key = trial_key(state.key, state.trial + 1, CALIBRATE)
-        found = calibration(key, belief, trajectory, dynamics=dynamics, angles=task.angles)
+        found = calibration(key, posterior, trajectory, dynamics=dynamics, angles=task.angles)
         return jnp.where(state.trial >= max(1, explore_trials), found, jnp.nan)
 
     return Experiment(
@@ -242,12 +242,12 @@ def experiment(
         init,
         run_episode,
         collect,
-        absorb,
+        add_episode,
         learn,
         improve_policy,
         succeed,
         improve,
-        look_ahead,
+        simulate,
         calibrate,
         None if task.environment is None else drive,
     )
@@ -278,9 +278,9 @@ def _unknown(like: jax.ShapeDtypeStruct) -> Array:
 
 
 def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunState, TrialInfo]:
-    """One round of Alg. 1: collect, absorb, improve; then `episodes` evaluation episodes that are not data."""
+    """One round of Alg. 1: collect, add_episode, improve; then `episodes` evaluation episodes that are not data."""
     trajectory = exp.collect(state)
-    state = exp.absorb(state, trajectory)
+    state = exp.add_episode(state, trajectory)
     state, (fitted, searched) = exp.improve(state)
     keys = jax.random.split(trial_key(state.key, state.trial, EVALUATE), episodes)
     evaluation = jax.vmap(exp.episode, (0, None, None))(keys, state.policy.params, False)

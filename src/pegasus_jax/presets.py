@@ -9,13 +9,13 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.checks import ConfigError, nearest
 from pegasus_jax.config import (
     BNN,
     GP,
     GYM,
     LBFGS,
-    MANOEUVRES,
+    MANEUVERS,
     MJCF,
     MLP,
     RBF,
@@ -73,10 +73,10 @@ DOUBLE_CARTPOLE_NETWORK = Config(
 )
 
 
-def swimmer(manoeuvre: str, legs: int, learning_rate: float = 1e-4) -> Config:
+def swimmer(maneuver: str, legs: int, learning_rate: float = 1e-4) -> Config:
     """docs/reference.md 3.4 with five networks (docs/decisions/0017); the policy's dropout is the paper's .1."""
     return Config(
-        task=f"swimmer_{manoeuvre}",
+        task=f"swimmer_{maneuver}",
         legs=legs,
         trials=50,
         model=BNN(hidden=(200,) * 4, initialiser="orthogonal", members=5, kl_weight=1.0),
@@ -100,8 +100,8 @@ def swimmer(manoeuvre: str, legs: int, learning_rate: float = 1e-4) -> Config:
 _OWN_COST = Search(widen=1.0, balanced=True, refine=0.5)
 
 _SWIMMERS = {
-    **{f"swimmer_{name}": swimmer(name, 2, 1e-3 if name == "depth_change" else 1e-4) for name in MANOEUVRES},
-    **{f"swimmer_{name}_six_legs": swimmer(name, 6) for name in MANOEUVRES},
+    **{f"swimmer_{name}": swimmer(name, 2, 1e-3 if name == "depth_change" else 1e-4) for name in MANEUVERS},
+    **{f"swimmer_{name}_six_legs": swimmer(name, 6) for name in MANEUVERS},
 }
 
 # With a Bayesian neural network as the paper has it: what `model=` and the paper's algorithms change.
@@ -199,12 +199,12 @@ def preset(
 
     `model`, `policy` and `algorithm` are the command line's words. A named model, and every algorithm but "pegasus",
     change the preset NAME_network where there is one: what was tuned for a preset's own model says nothing of another.
-    Raises SettingError for an unknown word, in one line with the nearest one.
+    Raises ConfigError for an unknown word, in one line with the nearest one.
     """
     said = {"preset": name, "model": model, "policy": policy, "algorithm": algorithm}
     for word, value in said.items():
         if value is not None and value not in WORDS[word]:
-            raise SettingError(f"{word}={value} is unknown; {nearest(value, WORDS[word])}")
+            raise ConfigError(f"{word}={value} is unknown; {nearest(value, WORDS[word])}")
     config = PRESETS[name if model is None and algorithm in (None, "pegasus") else network(name)]
     for change in (MODELS[model or "log_normal"], ALGORITHMS[algorithm or "pegasus"]):
         config = change(config)

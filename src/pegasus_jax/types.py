@@ -96,14 +96,14 @@ class Dynamics(NamedTuple):
     init: Callable[[Key], Params]
     prepare: Callable[[Dataset], Any]  # what the loss needs to know of the data set as a whole
     loss: Callable[[Params, Key, Batch, Any], Array]  # (params, key, batch, prepare(data)) -> scalar
-    condition: Callable[[Params, Dataset], Any]  # -> belief, all that a rollout needs
-    sample: Callable[[Key, Any], Params]  # (key, belief) -> draw: one function, one particle's w^(k)
-    apply: Callable[[Any, Params, Array, Array], Prediction]  # (belief, draw, x [D], u [U])
-    # (belief, mean [F + U], cov of (encoded state, control)) -> gaussian.Image of the change of state; None: not known
+    posterior: Callable[[Params, Dataset], Any]  # -> posterior, all that a rollout needs
+    sample: Callable[[Key, Any], Params]  # (key, posterior) -> draw: one function, one particle's w^(k)
+    apply: Callable[[Any, Params, Array, Array], Prediction]  # (posterior, draw, x [D], u [U])
+    # (posterior, mean [F + U], cov of (encoded state, control)) -> gaussian.Image of the change; None: not known
     moments: Callable[[Any, Array, Array], Any] | None = None
-    # (keys [K], belief) -> draws [K, ...]: the functions of K particles together; None: `sample`, vmapped
+    # (keys [K], posterior) -> draws [K, ...]: the functions of K particles together; None: `sample`, vmapped
     deal: Callable[[Key, Any], Params] | None = None
-    # apply -> the same of K particles at once, (belief, draws [K, ...], x [K, D], u [K, U]); None: vmapped
+    # apply -> the same of K particles at once, (posterior, draws [K, ...], x [K, D], u [K, U]); None: vmapped
     particles: Callable[[Callable[..., Prediction]], Callable[..., Prediction]] | None = None
 
 
@@ -168,7 +168,7 @@ class Task(NamedTuple):
 
 
 class Learner(NamedTuple):
-    """Parameters with the state of their optimiser."""
+    """Parameters with the state of their optimizer."""
 
     params: Params
     optimizer: Any
@@ -177,15 +177,15 @@ class Learner(NamedTuple):
 class Fitter(NamedTuple):
     """How a model learns from the data (Alg. 1 line 5)."""
 
-    init: Callable[[Params], Any]  # parameters -> the optimiser's state
+    init: Callable[[Params], Any]  # parameters -> the optimizer's state
     run: Callable[..., tuple[Learner, Any]]  # (key, learner, data, steps) -> (learner, FitInfo)
 
 
 class Searcher(NamedTuple):
     """How a policy improves in imagination (Alg. 1 line 6)."""
 
-    init: Callable[[Params], Any]  # parameters -> the optimiser's state
-    # (key, learner, belief, steps=, first=, earlier=, fresh=) -> (learner, SearchInfo): iterations first .. first +
+    init: Callable[[Params], Any]  # parameters -> the optimizer's state
+    # (key, learner, posterior, steps=, first=, earlier=, fresh=) -> (learner, SearchInfo): iterations first .. first +
     # steps - 1 of the search after `earlier` others; `fresh` are parameters of a policy that knows nothing
     run: Callable[..., tuple[Learner, Any]]
 
@@ -197,7 +197,7 @@ class RunState(NamedTuple):
     data: Dataset
     model: Learner
     policy: Learner
-    trial: Array  # [] int32, episodes absorbed so far
+    trial: Array  # [] int32, episodes added so far
     policy_trial: Array  # [] int32, the trial after which this policy was learned; 0: it has learned nothing yet
 
 
@@ -227,14 +227,14 @@ class Experiment(NamedTuple):
     init: Callable[[Key], RunState]
     episode: Callable[[Key, Params, Array | bool], Trajectory]  # (key, policy parameters, random controls?)
     collect: Callable[[RunState], Trajectory]  # Alg. 1 line 3; with `episode`, the only one that touches the plant
-    absorb: Callable[[RunState, Trajectory], RunState]  # Alg. 1 line 4
+    add_episode: Callable[[RunState, Trajectory], RunState]  # Alg. 1 line 4
     fit: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 5
     search: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 6
     # (state, policy parameters before the search) -> (state with the policy that goes on, Successor)
     succeed: Callable[[RunState, Params], tuple[RunState, Successor]]
     improve: Callable[[RunState], tuple[RunState, Any]]  # fit, search, succeed
     imagine: Callable[[RunState], tuple[Rollout, Array]]  # fresh scenarios -> (rollout, cost [H, K])
-    calibrate: Callable[[RunState, Trajectory], Array]  # of the model, on an episode not yet absorbed -> calibration
+    calibrate: Callable[[RunState, Trajectory], Array]  # of the model, on an episode not yet added -> calibration
     # `episode` on the task's environment, which says how it ended and keeps the rows of one that failed; None: the
     # plant is in JAX
     drive: Callable[[Key, Params, bool], Episode] | None = None

@@ -1,4 +1,4 @@
-"""The swimmer against C MuJoCo; its leg commands, its angles, its goals; and that its manoeuvres can be done."""
+"""The swimmer against C MuJoCo; its leg commands, its angles, its goals; and that its maneuvers can be done."""
 
 import jax
 import jax.numpy as jnp
@@ -152,7 +152,7 @@ BARS = {
 }
 
 
-def test_every_manoeuvre_can_be_done(swim):
+def test_every_maneuver_can_be_done(swim):
     """By a feedback on the observation at the control rate, as design asks; physics does not depend on the task."""
     legs, base, starts = legs_of(swim.plant), swim.plant, 4
     tasks = [task for some, task in BARS if some == legs]

@@ -1,4 +1,4 @@
-"""What the swimmer's four manoeuvres aim at: an error that is affine in the rates, the depth and sines and cosines."""
+"""What the swimmer's four maneuvers aim at: an error that is affine in the rates, the depth and sines and cosines."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -35,7 +35,7 @@ class Goal(NamedTuple):
 
 
 def goal(task: Task, legs: int, cost: Cost, roll_rate: Scalar) -> Goal:
-    """The aim of a manoeuvre; |e|^2 sums squared errors of depth and roll rate, and 2 - 2 cos of each angle's error."""
+    """The aim of a maneuver; |e|^2 sums squared errors of depth and roll rate, and 2 - 2 cos of each angle's error."""
     if task not in _SHAPED:
         raise ValueError(f"unknown swimmer task {task!r}: one of {', '.join(_SHAPED)}")
     if legs not in (2, 6):

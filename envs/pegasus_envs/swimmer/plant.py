@@ -1,4 +1,4 @@
-"""A six-legged swimmer, driven by periodic leg commands through its flippers: four manoeuvres, two or six legs."""
+"""A six-legged swimmer, driven by periodic leg commands through its flippers: four maneuvers, two or six legs."""
 
 import copy
 from collections.abc import Callable
@@ -59,7 +59,7 @@ def swimmer(
     stiffness: Scalar = 2.0,
     stroke_rate: float = 4.0,
 ) -> Plant:
-    """One manoeuvre; x = [roll, pitch, yaw, depth, three body rates, (the hip angles when all six legs swim)].
+    """One maneuver; x = [roll, pitch, yaw, depth, three body rates, (the hip angles when all six legs swim)].
 
     Args:
         task: `knife_edge` (roll 90 degrees), `belly_up` (180), `corkscrew` (roll steadily), `depth_change` (1 m down),
@@ -109,7 +109,7 @@ def swimmer(
 
 
 class _Body(NamedTuple):
-    """What the manoeuvres share."""
+    """What the maneuvers share."""
 
     place: Callable[[Array], Swimming]
     step: Callable[[Swimming, Array], Swimming]
@@ -119,7 +119,7 @@ class _Body(NamedTuple):
 
 
 def _body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
-    """The same functions for the same constants: all manoeuvres then run one compiled program."""
+    """The same functions for the same constants: all maneuvers then run one compiled program."""
     if any(isinstance(constant, jax.Array) for constant in constants):
         return _new_body(legs, stroke_rate, *constants)
     return _known_body(legs, stroke_rate, bool(jax.config.jax_enable_x64), *constants)  # pyright: ignore

@@ -121,7 +121,7 @@ WORDS = {"-h", "--help", "help"}
 
 
 def help_of(text: str, words: Sequence[str]) -> str:
-    """A command's help; of its settings as these words leave them. Raises SettingError for words that cannot be."""
+    """A command's help; of its settings as these words leave them. Raises ConfigError for words that cannot be."""
     if "{settings}" not in text:
         return text
     from pegasus_jax.config import KINDS, TASKS

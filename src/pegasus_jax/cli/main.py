@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from pegasus_jax import interrupt
-from pegasus_jax.checks import RunError, SettingError
+from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli import help, runs
 from pegasus_jax.cli import train as cli_train
 from pegasus_jax.runs import cache, files
@@ -90,7 +90,7 @@ def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: 
             return 0 if words else 2
         _remember_compilations()
         command(words)
-    except (SettingError, RunError) as error:
+    except (ConfigError, RunError) as error:
         interrupt.clean_up()
         print(f"pegasus: {error}", file=sys.stderr)
         return 2
@@ -112,7 +112,7 @@ def _always() -> list[str]:
     try:
         return shlex.split(text)
     except ValueError as error:
-        raise SettingError(f"PEGASUS_SETTINGS={text} cannot be read: {error}; expected key=value words") from error
+        raise ConfigError(f"PEGASUS_SETTINGS={text} cannot be read: {error}; expected key=value words") from error
 
 
 def _remember_compilations() -> None:

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pegasus_jax.checks import SettingError, whole
+from pegasus_jax.checks import ConfigError, whole
 
 
 def evaluate(words: Sequence[str]) -> None:
     run, rest = _run_and(words, {"episodes": "20", "seed": "0", "json": "false", "trial": "last", "mjcf": ""})
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     if rest["json"] not in ("true", "false"):
-        raise SettingError(f"json={rest['json']} is neither true nor false")
+        raise ConfigError(f"json={rest['json']} is neither true nor false")
     from pegasus_jax.runs.evaluation import evaluate_run
 
     result = evaluate_run(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None)
@@ -54,7 +54,7 @@ def figures(words: Sequence[str]) -> None:
 
     files = [word for word in words if "=" not in word]
     if len(files) != 1:
-        raise SettingError(f"name one file, not {len(files)}; for example benchmarks/figures/crn.toml")
+        raise ConfigError(f"name one file, not {len(files)}; for example benchmarks/figures/crn.toml")
     options, changed = config_io.split([word for word in words if "=" in word], comparison.OPTIONS)
     asked: dict[str, Any] = dict(seeds=options.get("seeds", ""), changes=[f"{k}={v}" for k, v in changed.items()])
     only = [label for label in options.get("variants", "").split(",") if label]
@@ -76,25 +76,25 @@ def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False)
 
     named = [word for word in words if "=" not in word]
     if len(named) != 1:
-        raise SettingError(f"name one run, not {len(named)}; for example runs/cartpole-seed0")
+        raise ConfigError(f"name one run, not {len(named)}; for example runs/cartpole-seed0")
     _, rest = config_io.split([word for word in words if "=" in word])
     for key in rest:
         if key not in defaults:
-            raise SettingError(
+            raise ConfigError(
                 f"{key} is not an option here; {nearest(key, defaults) if defaults else 'there are none'}"
             )
     path = Path(named[0])
     if runs := store.seeds_of(path):
         if not many:
-            raise SettingError(f"{path} holds the runs of {len(runs)} seeds; name one, for example {runs[min(runs)]}")
+            raise ConfigError(f"{path} holds the runs of {len(runs)} seeds; name one, for example {runs[min(runs)]}")
         return path, defaults | rest
     return store.existing(path), defaults | rest
 
 
 def _trial(text: str) -> int | str:
-    """The trial whose policy is asked for. Raises SettingError for a text that names none."""
+    """The trial whose policy is asked for. Raises ConfigError for a text that names none."""
     if text in ("last", "best"):
         return text
     if not text.isdecimal():
-        raise SettingError(f"trial={text} is not a trial; expected a number, best or last")
+        raise ConfigError(f"trial={text} is not a trial; expected a number, best or last")
     return int(text)

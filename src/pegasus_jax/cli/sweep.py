@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax.checks import SettingError, nearest, whole
+from pegasus_jax.checks import ConfigError, nearest, whole
 from pegasus_jax.cli.main import main
 
 SWEEP = """\
@@ -71,7 +71,7 @@ def values(text: str) -> list[str]:
     ranges = [re.fullmatch(r"(\d+)-(\d+)", part) for part in parts]
     for part, found in zip(parts, ranges, strict=True):
         if found and int(found[2]) - int(found[1]) >= MOST:
-            raise SettingError(f"{part} is a range of more than {MOST:,} numbers; give fewer, for example 0-9")
+            raise ConfigError(f"{part} is a range of more than {MOST:,} numbers; give fewer, for example 0-9")
     return [
         value
         for part, found in zip(parts, ranges, strict=True)
@@ -82,13 +82,13 @@ def values(text: str) -> list[str]:
 def jobs_of(words: dict[str, str], out: Path) -> list[Job]:
     """Every combination of the values of `words`, in their order, the last changing fastest.
 
-    Raises SettingError where two of them would be the same run.
+    Raises ConfigError where two of them would be the same run.
     """
     choices = {key: values(text) for key, text in words.items()}
     if empty := [key for key, found in choices.items() if not found or "" in found]:
-        raise SettingError(f"{empty[0]}={words[empty[0]]} has an empty value; for example seed=0,1,2 or seed=0-2")
+        raise ConfigError(f"{empty[0]}={words[empty[0]]} has an empty value; for example seed=0,1,2 or seed=0-2")
     if (count := math.prod(map(len, choices.values()))) > MOST:
-        raise SettingError(f"these are {count:,} combinations; a sweep has at most {MOST:,}")
+        raise ConfigError(f"these are {count:,} combinations; a sweep has at most {MOST:,}")
     swept = [key for key, found in choices.items() if len(found) > 1]
     jobs = []
     for combination in itertools.product(*choices.values()):
@@ -99,12 +99,12 @@ def jobs_of(words: dict[str, str], out: Path) -> list[Job]:
         jobs.append(Job(run, [*(f"{key}={value}" for key, value in chosen.items()), f"out={run}"]))
     counts = Counter(job.run for job in jobs)
     if twice := next((run for run, count in counts.items() if count > 1), None):
-        raise SettingError(f"two combinations would share the folder {twice}; give each value once")
+        raise ConfigError(f"two combinations would share the folder {twice}; give each value once")
     return jobs
 
 
 def check(job: Job) -> None:
-    """Raise SettingError for settings that cannot be, or a folder that holds runs already."""
+    """Raise ConfigError for settings that cannot be, or a folder that holds runs already."""
     from pegasus_jax import tasks
     from pegasus_jax.builder import build, set_precision
     from pegasus_jax.runs import config_io, store
@@ -114,7 +114,7 @@ def check(job: Job) -> None:
     set_precision(config)
     build(replace(config, seed=0))
     if store.holds(job.run):
-        raise SettingError(f"{job.run} holds a run already; another out= keeps both")
+        raise ConfigError(f"{job.run} holds a run already; another out= keeps both")
 
 
 def show(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) -> None:
@@ -147,12 +147,12 @@ def local(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any])
 
 
 def slurm(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) -> None:
-    """Submit the jobs as an array. Raises SettingError where there is no SLURM, or for an option it lacks."""
+    """Submit the jobs as an array. Raises ConfigError where there is no SLURM, or for an option it lacks."""
     executor = _executor("slurm", out)
     try:
         executor.update_parameters(slurm_array_parallelism=at_once, **options)
     except (NameError, TypeError, ValueError) as error:
-        raise SettingError(f"slurm.: {' '.join(str(error).split())}; for example slurm.time=120") from error
+        raise ConfigError(f"slurm.: {' '.join(str(error).split())}; for example slurm.time=120") from error
     with executor.batch():
         submitted = [executor.submit(_command(job)) for job in jobs]
     for job, handle in zip(jobs, submitted, strict=True):
@@ -167,18 +167,18 @@ LAUNCHERS: dict[str, Callable[[Sequence[Job], int, Path, dict[str, Any]], None]]
 
 
 def handle(words: Sequence[str]) -> None:
-    """Check a sweep, and give it to its launcher. Raises SettingError for what cannot be."""
+    """Check a sweep, and give it to its launcher. Raises ConfigError for what cannot be."""
     from pegasus_jax.runs import config_io
 
     options, rest = config_io.split(words, OPTIONS)
     launcher = options.get("launcher", "print")
     if launcher not in LAUNCHERS:
-        raise SettingError(f"launcher={launcher} is unknown; {nearest(launcher, LAUNCHERS)}")
+        raise ConfigError(f"launcher={launcher} is unknown; {nearest(launcher, LAUNCHERS)}")
     at_once = whole("jobs", options.get("jobs", "2"))
     out = Path(options.get("out", "runs/sweep"))
     of_slurm = {f"slurm_{key[6:]}": value for key, value in rest.items() if key.startswith("slurm.")}
     if of_slurm and launcher != "slurm":
-        raise SettingError(
+        raise ConfigError(
             f"{next(iter(of_slurm)).replace('_', '.', 1)}= is of no use with launcher={launcher}; launcher=slurm"
         )
     own = {key: value for key, value in rest.items() if not key.startswith("slurm.")}
@@ -190,17 +190,17 @@ def handle(words: Sequence[str]) -> None:
 
 
 def _executor(cluster: str, out: Path) -> Any:
-    """The library's executor. Raises SettingError where it or its cluster is missing."""
+    """The library's executor. Raises ConfigError where it or its cluster is missing."""
     try:
         import submitit
     except ImportError as error:
-        raise SettingError(
+        raise ConfigError(
             f"launcher={cluster} needs the extra sweep, pip install 'pegasus-jax[sweep]'; launcher=print needs nothing"
         ) from error
     try:
         return submitit.AutoExecutor(folder=out / "jobs", cluster=cluster)
     except RuntimeError as error:
-        raise SettingError(f"launcher={cluster}: {' '.join(str(error).split())}; launcher=local is here") from error
+        raise ConfigError(f"launcher={cluster}: {' '.join(str(error).split())}; launcher=local is here") from error
 
 
 def _command(job: Job, environment: dict[str, str] | None = None) -> Any:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax.checks import SettingError, whole
+from pegasus_jax.checks import ConfigError, whole
 from pegasus_jax.config import GYM, Config, Search, label
 
 OPTIONS = (
@@ -50,7 +50,7 @@ def train(words: Sequence[str]) -> None:
     if asked.resumed is None and leads():
         if store.seeds_of(asked.home):
             free = store.free(asked.home)
-            raise SettingError(f"out={asked.home} holds runs already; resume={asked.home} goes on, out={free} is free")
+            raise ConfigError(f"out={asked.home} holds runs already; resume={asked.home} goes on, out={free} is free")
         for run in asked.runs.values():
             store.create(run)
     train_seeds(
@@ -66,20 +66,18 @@ def train(words: Sequence[str]) -> None:
 
 
 def understood(words: Sequence[str]) -> Asked:
-    """What the words ask for. Raises SettingError for what cannot be; nothing of the user's is imported for that."""
+    """What the words ask for. Raises ConfigError for what cannot be; nothing of the user's is imported for that."""
     from pegasus_jax.runs import config_io
 
     options, rest = config_io.split(words, OPTIONS)
     for name in ("out", "resume"):
         if options.get(name) == "":
-            raise SettingError(f"{name}= names no folder; for example {name}=runs/demo")
+            raise ConfigError(f"{name}= names no folder; for example {name}=runs/demo")
     asked = _resumed(options, rest) if "resume" in options else _new(options, rest)
     if len(asked.runs) > 1 and asked.config.task == GYM:
-        raise SettingError(
-            f"seeds={len(asked.runs)} is too many for task=gym, whose environment is one object; seeds=1"
-        )
+        raise ConfigError(f"seeds={len(asked.runs)} is too many for task=gym, whose environment is one object; seeds=1")
     if options.get("final", "false") not in ("true", "false"):
-        raise SettingError(f"final={options['final']} is neither true nor false")
+        raise ConfigError(f"final={options['final']} is neither true nor false")
     return asked
 
 
@@ -88,7 +86,7 @@ def _resumed(options: dict[str, str], rest: dict[str, str]) -> Asked:
 
     free = {"resume", "final", "mesh", "distributed", "coordinator", "processes", "process"}
     if wrong := sorted(key for key in {*rest, *options} - free if not _changeable(key)):
-        raise SettingError(
+        raise ConfigError(
             f"{wrong[0]} cannot be changed by resume=; only trials=, evaluation=, fit.*, search.* can, and mjcf= if"
             " the file was moved"
         )
@@ -168,7 +166,7 @@ def check(words: Sequence[str]) -> None:
 
     options, rest = config_io.split(words, OPTIONS)
     if "resume" in options:
-        raise SettingError(f"resume={options['resume']} was checked when it began; give the words of a new run")
+        raise ConfigError(f"resume={options['resume']} was checked when it began; give the words of a new run")
     config = config_io.parse(rest, options=OPTIONS)
     from pegasus_jax.runs.check import report
 
@@ -188,9 +186,9 @@ def _join(options: dict[str, str]) -> None:
     if not given and options.get("distributed", "false") == "false":
         return
     if given and len(given) < 3:
-        raise SettingError("coordinator=HOST:PORT, processes=N and process=I (from 0) go together")
+        raise ConfigError("coordinator=HOST:PORT, processes=N and process=I (from 0) go together")
     if options.get("distributed", "true") != "true":
-        raise SettingError(f"distributed={options['distributed']} is neither true nor false")
+        raise ConfigError(f"distributed={options['distributed']} is neither true nor false")
     try:
         if given:
             count, index = (whole(name, options[name]) for name in ("processes", "process"))
@@ -198,7 +196,7 @@ def _join(options: dict[str, str]) -> None:
         else:
             jax.distributed.initialize()  # SLURM, Open MPI and others say where the coordinator is
     except (RuntimeError, ValueError) as error:
-        raise SettingError(f"distributed=true: {str(error).splitlines()[0]}; or give coordinator=HOST:PORT") from error
+        raise ConfigError(f"distributed=true: {str(error).splitlines()[0]}; or give coordinator=HOST:PORT") from error
 
 
 def _mesh(text: str | None, seeds: int) -> Any:
@@ -210,12 +208,10 @@ def _mesh(text: str | None, seeds: int) -> Any:
         return evenly(seeds)
     first, cross, second = text.partition("x")
     if not (cross and first.isdecimal() and second.isdecimal() and int(first) and int(second)):
-        raise SettingError(f"mesh={text} is not of the form SEEDSxPARTICLES; for example mesh=4x1")
+        raise ConfigError(f"mesh={text} is not of the form SEEDSxPARTICLES; for example mesh=4x1")
     if seeds % int(first):
-        raise SettingError(
-            f"mesh={text} cannot share {seeds} seeds evenly; mesh={math.gcd(seeds, int(first))}x{second}"
-        )
+        raise ConfigError(f"mesh={text} cannot share {seeds} seeds evenly; mesh={math.gcd(seeds, int(first))}x{second}")
     try:
         return mesh(int(first), int(second))
     except ValueError as error:
-        raise SettingError(f"mesh={text} {error}") from error
+        raise ConfigError(f"mesh={text} {error}") from error

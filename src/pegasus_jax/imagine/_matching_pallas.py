@@ -68,7 +68,7 @@ def matched(x: Any, z: Any, out: Any) -> None:
 def pulled(x: Any, z: Any, cotangent: Any, out: Any) -> None:
     """The cotangent of x: as `moments.cholesky` has its derivative, turned round."""
     own = Particles(*x.shape)
-    _, centred, cov = own.moments(own.read(x))
+    _, centered, cov = own.moments(own.read(x))
     _, root, floored = factor(cov)
     given, draws = own.read(cotangent), own.read(z)
     size = len(given)
@@ -86,7 +86,7 @@ def pulled(x: Any, z: Any, cotangent: Any, out: Any) -> None:
     of_cov = [substituted(root, [column[i] for column in columns]) for i in range(size)]
     slope = [[(of_cov[i][j] + of_cov[j][i]) / (own.count - 1) for j in range(size)] for i in range(size)]
     of_mean = [jnp.sum(g) / own.count for g in given]
-    own.write(out, [m + dot(row, centred) for m, row in zip(of_mean, slope, strict=True)])
+    own.write(out, [m + dot(row, centered) for m, row in zip(of_mean, slope, strict=True)])
 
 
 class Particles:
@@ -108,9 +108,9 @@ class Particles:
     def moments(self, x: list[Array]) -> tuple[list[Array], list[Array], Matrix]:
         """Mean, x - mean, and the lower half of the unbiased covariance."""
         mean = [jnp.sum(column) / self.count for column in x]
-        centred = [jnp.where(self.there, column - m, 0.0) for column, m in zip(x, mean, strict=True)]
-        cov = [[jnp.sum(centred[i] * centred[j]) / (self.count - 1) for j in range(i + 1)] for i in range(self.size)]
-        return mean, centred, cov
+        centered = [jnp.where(self.there, column - m, 0.0) for column, m in zip(x, mean, strict=True)]
+        cov = [[jnp.sum(centered[i] * centered[j]) / (self.count - 1) for j in range(i + 1)] for i in range(self.size)]
+        return mean, centered, cov
 
 
 def factor(cov: Matrix) -> tuple[Matrix, Matrix, list[Array]]:

@@ -131,7 +131,7 @@ def of_matched(expected: Expected) -> Callable[[Array], Array]:
 
 
 def mean(costs: Array) -> Array:
-    """Mean cost a step and particle: what the authors' code minimises."""
+    """Mean cost a step and particle: what the authors' code minimizes."""
     return jnp.mean(costs)
 
 

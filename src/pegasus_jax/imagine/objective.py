@@ -11,7 +11,7 @@ from pegasus_jax.types import Array, Dynamics, Params, Policy, Scenarios
 
 def objective(
     policy_params: Params,
-    belief: Params,
+    posterior: Params,
     scenarios: Scenarios,
     *,
     dynamics: Dynamics,
@@ -25,7 +25,7 @@ def objective(
     """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
     imagined = rollout(
         policy_params,
-        belief,
+        posterior,
         scenarios,
         dynamics=dynamics,
         policy=policy,

@@ -1,4 +1,4 @@
-"""K imagined trajectories as a deterministic function of policy, belief and scenarios. No keys here."""
+"""K imagined trajectories as a deterministic function of policy, posterior and scenarios. No keys here."""
 
 from collections.abc import Callable
 from functools import partial
@@ -25,7 +25,7 @@ class NoiseUse(NamedTuple):
 
 def rollout(
     policy_params: Params,
-    belief: Params,
+    posterior: Params,
     scenarios: Scenarios,
     *,
     dynamics: Dynamics,
@@ -55,7 +55,7 @@ def rollout(
             x = limited(x, limit)
         u = act(policy_params, scenarios.policy, x + noise.policy * seeing)
         check_shape("what policy.apply returns for K particles", u, (len(x), None), "[K, U]")
-        change = predict(belief, scenarios.dynamics, x, u)
+        change = predict(posterior, scenarios.dynamics, x, u)
         for name, value in change._asdict().items():
             check_shape(f"{name} of what dynamics.apply returns for K particles", value, x.shape, "[K, D]")
         std = jax.lax.stop_gradient(change.std)

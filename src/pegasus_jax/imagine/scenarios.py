@@ -6,11 +6,11 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pegasus_jax.math.linalg import standardise
+from pegasus_jax.math.linalg import standardize
 from pegasus_jax.sharding import Spread, together
 from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, Scenarios
 
-Block = Callable[[Key, Params], Params]  # (key, belief) -> that part of the scenarios
+Block = Callable[[Key, Params], Params]  # (key, posterior) -> that part of the scenarios
 
 
 class Blocks(NamedTuple):
@@ -48,18 +48,18 @@ def blocks(
         states = jax.eval_shape(start, key).shape[0]
         # Drawn as one long row: the same numbers, by loops that need not stop every few dimensions.
         z = jax.random.normal(key, (horizon * particles * states,)).reshape(horizon, particles, states)
-        return spread(standardise(z) if balanced else z, 1)
+        return spread(standardize(z) if balanced else z, 1)
 
     return Blocks(
         start=lambda key, _: each(jax.vmap(start), key),
-        dynamics=lambda key, belief: each(lambda keys: deal(keys, belief), key),
+        dynamics=lambda key, posterior: each(lambda keys: deal(keys, posterior), key),
         policy=lambda key, _: each(jax.vmap(policy.sample), key),
         sensor=normal,
         match=normal,
     )
 
 
-def draw(key: Key, step: Array | int, belief: Params, *, blocks: Blocks, period: Period) -> Scenarios:
+def draw(key: Key, step: Array | int, posterior: Params, *, blocks: Blocks, period: Period) -> Scenarios:
     """The scenarios in force at a search iteration.
 
     Block b at iteration i is drawn from fold_in(fold_in(key, b), i // period_b): any iteration's scenarios can be had
@@ -68,17 +68,19 @@ def draw(key: Key, step: Array | int, belief: Params, *, blocks: Blocks, period:
     epochs = jnp.stack([_epoch(step, every) for every in period])
     folded = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(len(blocks)))  # all at once: quick to compile
     keys = jax.vmap(jax.random.fold_in)(folded, epochs)
-    return Scenarios(*(sample(keys[i], belief) for i, sample in enumerate(blocks)))
+    return Scenarios(*(sample(keys[i], posterior) for i, sample in enumerate(blocks)))
 
 
-def redraw(key: Key, step: Array, scenarios: Scenarios, belief: Params, *, blocks: Blocks, period: Period) -> Scenarios:
+def redraw(
+    key: Key, step: Array, scenarios: Scenarios, posterior: Params, *, blocks: Blocks, period: Period
+) -> Scenarios:
     """`draw` for the iteration after the one whose scenarios are given; draws only the blocks that change."""
     renewed = {}
     for every in sorted(set(period) - {0}):
         names = [name for name, p in zip(Scenarios._fields, period, strict=True) if p == every]
 
         def fresh(names: list[str] = names) -> dict[str, Params]:
-            drawn = draw(key, step, belief, blocks=blocks, period=period)  # the blocks not asked for are dead code
+            drawn = draw(key, step, posterior, blocks=blocks, period=period)  # the blocks not asked for are dead code
             return {name: getattr(drawn, name) for name in names}
 
         def held(names: list[str] = names) -> dict[str, Params]:

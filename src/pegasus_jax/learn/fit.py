@@ -1,4 +1,4 @@
-"""Model learning: minimise a model's loss over minibatches of all data (eq. 2, Alg. 1 line 5)."""
+"""Model learning: minimize a model's loss over minibatches of all data (eq. 2, Alg. 1 line 5)."""
 
 from collections.abc import Callable
 from typing import NamedTuple

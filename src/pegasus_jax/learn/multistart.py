@@ -30,7 +30,7 @@ def best_of(
     def run(
         key: Key,
         learner: Learner,
-        belief: Params,
+        posterior: Params,
         *,
         first: Array | int,
         steps: int,
@@ -51,7 +51,7 @@ def best_of(
             return Learner(members, jax.vmap(searcher.init)(members))
 
         members = jax.lax.cond(jnp.asarray(first) == 0, begun, lambda: learner.optimizer)
-        search = lambda member: searcher.run(key, member, belief, first=first, steps=steps, earlier=earlier)  # noqa: E731
+        search = lambda member: searcher.run(key, member, posterior, first=first, steps=steps, earlier=earlier)  # noqa: E731
         members, info = jax.vmap(search)(members)
         values = jnp.mean(info.objective[:, -window:], 1)
         best = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values))

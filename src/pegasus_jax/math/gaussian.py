@@ -199,13 +199,13 @@ def rbf_moments(
     size, outputs = mean.shape[0], beta.shape[0]
     identity = jnp.eye(size, dtype=mean.dtype)
     precision = lengthscales**-2  # [E, F]
-    centred = inputs - mean  # [n, F]
-    scaled = centred * precision[:, None, :]  # [E, n, F]
+    centered = inputs - mean  # [n, F]
+    scaled = centered * precision[:, None, :]  # [E, n, F]
     ratio = identity + cov * precision[:, None, :]  # [E, F, F], I + S W
     reach = jnp.linalg.solve(ratio, jnp.broadcast_to(cov, ratio.shape))  # [E, F, F], (S^-1 + W)^-1
     smooth = scaled - (scaled @ reach) * precision[:, None, :]  # [E, n, F], (S + W^-1)^-1 (x_i - m)
     log_det = jnp.linalg.slogdet(ratio)[1]  # [E]
-    log_kernel = jnp.log(variance)[:, None] - 0.5 * (jnp.sum(smooth * centred, -1) + log_det[:, None])
+    log_kernel = jnp.log(variance)[:, None] - 0.5 * (jnp.sum(smooth * centered, -1) + log_det[:, None])
     kernel = jnp.exp(log_kernel)  # [E, n], E[k(x, x_i)]
     terms = beta * kernel
 

@@ -48,11 +48,11 @@ def _factor(cov: Array) -> tuple[Array, Array]:
 def mean_and_cov(x: Array) -> tuple[Array, Array]:
     """Mean [D] and unbiased covariance [D, D] of particles x [K, D]."""
     mean = jnp.mean(x, 0)
-    centred = x - mean
-    return mean, centred.T @ centred / (x.shape[0] - 1)
+    centered = x - mean
+    return mean, centered.T @ centered / (x.shape[0] - 1)
 
 
-def standardise(z: Array) -> Array:
+def standardize(z: Array) -> Array:
     """Draws z [..., K, D] with their sample mean made exactly 0 and sample covariance exactly I, over K."""
 
     def one(z: Array) -> Array:

@@ -26,14 +26,14 @@ def whitener(rows: Array, size: Array, *, full: bool = True, jitter: float = 1e-
     used = (jnp.arange(rows.shape[0]) < size)[:, None]
     count = jnp.maximum(size, 1).astype(rows.dtype)
     mean = jnp.sum(jnp.where(used, rows, 0), 0) / count
-    centred = jnp.where(used, rows - mean, 0)
-    variance = jnp.maximum(jnp.sum(centred**2, 0) / count, 1e-12)
+    centered = jnp.where(used, rows - mean, 0)
+    variance = jnp.maximum(jnp.sum(centered**2, 0) / count, 1e-12)
     scale = jnp.sqrt(variance)
     if not full:
         return Whitener(mean, jnp.diag(scale), jnp.diag(1 / scale))
     # The factor is taken of the correlation matrix, whose entries are all of order one.
     identity = jnp.eye(rows.shape[1], dtype=rows.dtype)
-    correlation = (centred / scale).T @ (centred / scale) / count
+    correlation = (centered / scale).T @ (centered / scale) / count
     free = independent(correlation)
     correlation = jnp.where(free[:, None] & free, correlation, identity)
     root = jnp.linalg.cholesky(correlation + jitter * identity)

@@ -21,7 +21,7 @@ State = tuple[Array, ...]  # 2n of [B]: the coordinates, then their speeds
 
 
 class Mechanism(NamedTuple):
-    """What the equations need of a belief. Here, the numbers and rows; in `mechanics_kernel` also whole arrays."""
+    """What the equations need of a posterior. Here, the numbers and rows; in `mechanics_kernel` also whole arrays."""
 
     centre: Any  # [n]
     spread: Any  # [n]

@@ -32,25 +32,25 @@ def suits(hidden: Sequence[int], coordinates: int) -> bool:
 def fused(
     plain: Callable[..., Array], order: np.ndarray, **mechanics: Any
 ) -> Callable[[Any, Any, Array, Array], Array]:
-    """`plain`, changes of state [K, D] of (belief, masks, x [K, D], u [K, U]), as kernels; `mechanics` as in `period`.
+    """`plain`, changes of state [K, D] of (posterior, masks, x [K, D], u [K, U]), as kernels.
 
-    x[:, order] is the coordinates and then their speeds. The gradient by the belief and the masks, which no search
+    x[:, order] is the coordinates and then their speeds. The gradient by the posterior and the masks, which no search
     asks for, is that of `plain`.
     """
     forward, backward = period(**mechanics)
     inverse = np.argsort(order)
 
-    def there(belief: Any, masks: Sequence[Any], x: Array, u: Array) -> tuple[Array, Any]:
+    def there(posterior: Any, masks: Sequence[Any], x: Array, u: Array) -> tuple[Array, Any]:
         state = x.T[order]
-        after, saved = forward(*mechanism(belief, masks), state, (u / belief.units.control).T)
-        return (after - state)[inverse].T, (belief, masks, x, u, saved)
+        after, saved = forward(*mechanism(posterior, masks), state, (u / posterior.units.control).T)
+        return (after - state)[inverse].T, (posterior, masks, x, u, saved)
 
     def back(residuals: Any, cotangent: Array) -> Any:
-        belief, masks, x, u, saved = residuals
+        posterior, masks, x, u, saved = residuals
         given = cotangent.T[order]
-        pulled = backward(*mechanism(belief, masks), (u / belief.units.control).T, saved, given)
-        of_x, of_u = (pulled[: len(order)] - given)[inverse].T, pulled[len(order) :].T / belief.units.control
-        _, pull = jax.vjp(lambda belief, masks: plain(belief, masks, x, u), belief, masks)
+        pulled = backward(*mechanism(posterior, masks), (u / posterior.units.control).T, saved, given)
+        of_x, of_u = (pulled[: len(order)] - given)[inverse].T, pulled[len(order) :].T / posterior.units.control
+        _, pull = jax.vjp(lambda posterior, masks: plain(posterior, masks, x, u), posterior, masks)
         return *pull(cotangent), of_x, of_u
 
     change = jax.custom_vjp(lambda *arguments: there(*arguments)[0])
@@ -167,9 +167,9 @@ class Rows:
         return [None if ref is None else load(ref) for ref in refs]
 
 
-def mechanism(belief: Any, masks: Sequence[Any]) -> tuple[Mechanism, list[Any]]:
-    """A belief's arrays and the hidden units' masks [K, width], layers filled up with idle units to powers of two."""
-    params, units = belief
+def mechanism(posterior: Any, masks: Sequence[Any]) -> tuple[Mechanism, list[Any]]:
+    """A posterior's arrays and the hidden units' masks [K, width], layers padded with idle units to powers of two."""
+    params, units = posterior
     layers = [params["network"]["params"][f"layer_{i}"] for i in range(len(masks))]
     widths = [max(16, 1 << (layer["bias"].shape[0] - 1).bit_length()) for layer in layers[:-1]]
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from pegasus_jax.math.angles import encode
 from pegasus_jax.math.normalize import Whitener, unwhiten, whitener
-from pegasus_jax.models.noisy import HEADS, Head, Masks, misfit, noisy
+from pegasus_jax.models.noisy import HEADS, Head, Masks, nll, noisy
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 
 
@@ -18,10 +18,10 @@ class Scaling(NamedTuple):
     size: Array  # [] rows the statistics come from
 
 
-class Belief(NamedTuple):
+class Posterior(NamedTuple):
     """A fitted network whose outer layers contain the scaling, so that a rollout does not repeat it at each step."""
 
-    network: Params  # centred inputs -> change of state [D], raw std [D]
+    network: Params  # centered inputs -> change of state [D], raw std [D]
     raw_std: Array | None  # [D], of a network that does not predict it
     noise: Params
     scaling: Scaling
@@ -55,7 +55,7 @@ def bnn(
     def prepare(data: Dataset) -> Scaling:
         return Scaling(whitener(inputs_of(data.x, data.u), data.size), whitener(data.y, data.size), data.size)
 
-    def believe(params: Params, scaling: Scaling) -> Belief:
+    def believe(params: Params, scaling: Scaling) -> Posterior:
         layers = dict(params["network"]["params"])
         layers["layer_0"] = {**layers["layer_0"], "kernel": scaling.inputs.inverse.T @ layers["layer_0"]["kernel"]}
         last, targets = layers[f"layer_{len(hidden)}"], scaling.targets
@@ -64,28 +64,28 @@ def bnn(
             "kernel": jnp.concatenate([kernel[:, :states] @ targets.root.T, kernel[:, states:]], 1),
             "bias": jnp.concatenate([unwhiten(targets, bias[:states]), bias[states:]]),
         }
-        return Belief({"params": layers}, params.get("raw_std"), params["noise"], scaling)
+        return Posterior({"params": layers}, params.get("raw_std"), params["noise"], scaling)
 
-    def predict(belief: Belief, masks: Masks, x: Array, u: Array) -> Prediction:
-        inputs, scaling = inputs_of(x, u), belief.scaling
-        out = network.apply(belief.network, inputs - scaling.inputs.mean, masks)
+    def predict(posterior: Posterior, masks: Masks, x: Array, u: Array) -> Prediction:
+        inputs, scaling = inputs_of(x, u), posterior.scaling
+        out = network.apply(posterior.network, inputs - scaling.inputs.mean, masks)
         mean, raw = out[..., :states], out[..., states:]
-        if belief.raw_std is not None:
-            raw = jnp.broadcast_to(belief.raw_std, mean.shape)
+        if posterior.raw_std is not None:
+            raw = jnp.broadcast_to(posterior.raw_std, mean.shape)
         return Prediction(mean, head(raw) * jnp.diagonal(scaling.targets.root))
 
     def loss(params: Params, key: Key, batch: Batch, scaling: Scaling) -> Array:
         """Eq. 2 divided by N, with fresh noise for every row."""
         masks = network.sample(key, params["noise"], batch.x.shape[0])
         predicted = predict(believe(params, scaling), masks, batch.x, batch.u)
-        return misfit(predicted, batch.y) + network.penalty(params) / scaling.size
+        return nll(predicted, batch.y) + network.penalty(params) / scaling.size
 
     return Dynamics(
         init=init,
         prepare=prepare,
         loss=loss,
-        condition=lambda params, data: believe(params, prepare(data)),
+        posterior=lambda params, data: believe(params, prepare(data)),
         # The masks of one particle, w^(k) = g_2(w, z_w^(k)) (Alg. 3 line 9): all that differs between particles.
-        sample=lambda key, belief: network.sample(key, belief.noise),
+        sample=lambda key, posterior: network.sample(key, posterior.noise),
         apply=predict,
     )

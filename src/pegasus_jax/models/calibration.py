@@ -11,7 +11,13 @@ HALF = 0.6744897501960817  # half of a standard normal's draws are nearer to zer
 
 
 def calibration(
-    key: Key, belief: Params, trajectory: Trajectory, *, dynamics: Dynamics, angles: tuple[int, ...], draws: int = DRAWS
+    key: Key,
+    posterior: Params,
+    trajectory: Trajectory,
+    *,
+    dynamics: Dynamics,
+    angles: tuple[int, ...],
+    draws: int = DRAWS,
 ) -> Array:
     """The model's one-step errors along an episode, in standard deviations that it predicted.
 
@@ -19,7 +25,7 @@ def calibration(
     dimensions, of squared error / predictive variance, divided by its value for Gaussian errors of the predicted size;
     the median, because a few steps outside the data would decide a mean.
     """
-    error, variance = one_step_errors(key, belief, trajectory, dynamics=dynamics, angles=angles, draws=draws)
+    error, variance = one_step_errors(key, posterior, trajectory, dynamics=dynamics, angles=angles, draws=draws)
     if trajectory.length is None:
         return overconfidence(error, variance)
     took_place = (jnp.arange(error.shape[0]) < trajectory.length)[:, None]
@@ -32,16 +38,22 @@ def overconfidence(error: Array, variance: Array) -> Array:
 
 
 def one_step_errors(
-    key: Key, belief: Params, trajectory: Trajectory, *, dynamics: Dynamics, angles: tuple[int, ...], draws: int = DRAWS
+    key: Key,
+    posterior: Params,
+    trajectory: Trajectory,
+    *,
+    dynamics: Dynamics,
+    angles: tuple[int, ...],
+    draws: int = DRAWS,
 ) -> tuple[Array, Array]:
     """Errors of the model's mean along an episode, and the variances that it predicts for them: each [H, D].
 
     The predictive variance is that of the draws' means, what the model does not know, and the mean square of their
     noise.
     """
-    functions = jax.vmap(dynamics.sample, (0, None))(jax.random.split(key, draws), belief)
+    functions = jax.vmap(dynamics.sample, (0, None))(jax.random.split(key, draws), posterior)
     along = jax.vmap(dynamics.apply, (None, None, 0, 0))
-    predicted = jax.vmap(along, (None, 0, None, None))(belief, functions, trajectory.x[:-1], trajectory.u)
+    predicted = jax.vmap(along, (None, 0, None, None))(posterior, functions, trajectory.x[:-1], trajectory.u)
     variance = jnp.var(predicted.mean, axis=0, ddof=1) + jnp.mean(predicted.std**2, axis=0)
     error = difference(difference(trajectory.x[1:], trajectory.x[:-1], angles), jnp.mean(predicted.mean, 0), angles)
     return error, variance

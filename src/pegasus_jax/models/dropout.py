@@ -159,7 +159,7 @@ def log_normal(
     authors' code has a stray 1 / sigma in it. ValueError for an empty interval or scale range.
 
     Float32: low <= mu <= high gives alpha <= 0 <= beta, and sigma <= (high - low) / sqrt(12) gives beta - alpha >=
-    3.46, so the normaliser Z is never under .499: neither it nor the quantile can suffer cancellation, wherever the
+    3.46, so the normalizer Z is never under .499: neither it nor the quantile can suffer cancellation, wherever the
     parameters go.
     """
     max_scale = (high - low) / math.sqrt(12.0)

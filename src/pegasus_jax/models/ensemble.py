@@ -42,28 +42,28 @@ def ensemble(member: Dynamics, members: int) -> Dynamics:
         # The sum, so that each member's gradient is what it would be alone.
         return jnp.sum(jax.vmap(one)(params, jax.random.split(key, members)))
 
-    def condition(params: Params, data: Dataset) -> Params:
-        return jax.vmap(member.condition, (0, None))(params, data)
+    def posterior(params: Params, data: Dataset) -> Params:
+        return jax.vmap(member.posterior, (0, None))(params, data)
 
-    def follow(index: Array, key: Key, belief: Params) -> tuple[Array, Params]:
-        return jax.nn.one_hot(index, members), member.sample(key, jax.tree.map(lambda leaf: leaf[index], belief))
+    def follow(index: Array, key: Key, posterior: Params) -> tuple[Array, Params]:
+        return jax.nn.one_hot(index, members), member.sample(key, jax.tree.map(lambda leaf: leaf[index], posterior))
 
-    def sample(key: Key, belief: Params) -> tuple[Array, Params]:
+    def sample(key: Key, posterior: Params) -> tuple[Array, Params]:
         chosen, own = jax.random.split(key)
-        return follow(jax.random.randint(chosen, (), 0, members), own, belief)
+        return follow(jax.random.randint(chosen, (), 0, members), own, posterior)
 
-    def deal(keys: Key, belief: Params) -> Dealt:
-        return Dealt(*jax.vmap(follow, (0, 0, None))(jnp.arange(len(keys)) % members, keys, belief))
+    def deal(keys: Key, posterior: Params) -> Dealt:
+        return Dealt(*jax.vmap(follow, (0, 0, None))(jnp.arange(len(keys)) % members, keys, posterior))
 
-    def apply(belief: Params, draw: tuple[Array, Params], x: Array, u: Array) -> Prediction:
+    def apply(posterior: Params, draw: tuple[Array, Params], x: Array, u: Array) -> Prediction:
         chosen, own = draw
-        mean, std = jax.vmap(member.apply, (0, None, None, None))(belief, own, x, u)
+        mean, std = jax.vmap(member.apply, (0, None, None, None))(posterior, own, x, u)
         return Prediction(chosen @ mean, chosen @ std)
 
     def particles(given: Callable[..., Prediction]) -> Callable[..., Prediction]:
-        def together(belief: Params, draws: Any, x: Array, u: Array) -> Prediction:
+        def together(posterior: Params, draws: Any, x: Array, u: Array) -> Prediction:
             if given is not apply or not isinstance(draws, Dealt):
-                return jax.vmap(given, (None, 0, 0, 0))(belief, draws, x, u)
+                return jax.vmap(given, (None, 0, 0, 0))(posterior, draws, x, u)
             rounds = -(-len(x) // members)
             filled = jnp.arange(rounds * members) % len(x)  # a last round that is not whole begins again, for nobody
 
@@ -72,9 +72,9 @@ def ensemble(member: Dynamics, members: int) -> Dynamics:
                 return whole.reshape(rounds, members, *rows.shape[1:])
 
             each = jax.vmap(jax.vmap(member.apply, (None, 0, 0, 0)), (0, 1, 1, 1), 1)
-            answers = each(belief, *jax.tree.map(split, (draws.own, x, u)))
+            answers = each(posterior, *jax.tree.map(split, (draws.own, x, u)))
             return jax.tree.map(lambda answer: answer.reshape(-1, *answer.shape[2:])[: len(x)], answers)
 
         return together
 
-    return Dynamics(init, member.prepare, loss, condition, sample, apply, deal=deal, particles=particles)
+    return Dynamics(init, member.prepare, loss, posterior, sample, apply, deal=deal, particles=particles)

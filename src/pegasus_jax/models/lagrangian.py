@@ -36,7 +36,7 @@ class Units(NamedTuple):
     size: Array  # [] rows these come from
 
 
-class Belief(NamedTuple):
+class Posterior(NamedTuple):
     """A fitted mechanism."""
 
     params: Params
@@ -56,7 +56,7 @@ def lagrangian(
     weight_decay: float = 1.0,
     **noise: Any,
 ) -> Dynamics:
-    """A distribution over mechanisms with n = D / 2 generalised coordinates q and their speeds v, in any order in x.
+    """A distribution over mechanisms with n = D / 2 generalized coordinates q and their speeds v, in any order in x.
 
     A network with noise on its units says, of q alone, the lower triangular root L of the mass matrix and the
     potential V; M = L L'. With constants B, c and R beside it, and all in the data's units,
@@ -97,19 +97,19 @@ def lagrangian(
             size=data.size,
         )
 
-    def energies(belief: Belief, masks: Masks, q: Array) -> tuple[Array, Array]:
+    def energies(posterior: Posterior, masks: Masks, q: Array) -> tuple[Array, Array]:
         """L [n, n] and V [] at q [n]."""
-        features = encode((q - belief.units.centre) / belief.units.spread, turning)
-        out = network.apply(belief.params["network"], features, masks)
+        features = encode((q - posterior.units.centre) / posterior.units.spread, turning)
+        out = network.apply(posterior.params["network"], features, masks)
         entries = jnp.where(rows == columns, LEAST_MASS + jax.nn.softplus(1 + out[:-1]), out[:-1])
         zero = jnp.zeros((), out.dtype)
         lower = [entries[i * (i + 1) // 2 + j] if j <= i else zero for i in range(n) for j in range(n)]
         return jnp.stack(lower).reshape(n, n), out[-1]
 
-    def acceleration(belief: Belief, masks: Masks, q: Array, v: Array, u: Array) -> Array:
+    def acceleration(posterior: Posterior, masks: Masks, q: Array, v: Array, u: Array) -> Array:
         """Change of v [n] in a control period; v and u [U] in their units."""
-        params, units = belief
-        (lower, _), along = jax.linearize(lambda q: energies(belief, masks, q), q)
+        params, units = posterior
+        (lower, _), along = jax.linearize(lambda q: energies(posterior, masks, q), q)
         slopes, pull = jax.vmap(along)(jnp.diag(units.speed * dt))  # [n, n, n], [n]: of L and V by each coordinate
         # Sums, not matrix products: a few numbers each, they are compiled into one loop over particles.
         change, momentum = jnp.sum(v[:, None, None] * slopes, 0), jnp.sum(v[:, None] * lower, 0)  # dL/dt, and L' v
@@ -118,14 +118,14 @@ def lagrangian(
         force -= jnp.sum(change * momentum + lower * jnp.sum(v[:, None] * change, 0), 1)
         return within(solve(lower, force), GREATEST_CHANGE)
 
-    def predict(belief: Belief, masks: Masks, x: Array, u: Array) -> Prediction:
-        units, h = belief.units, 1 / substeps
+    def predict(posterior: Posterior, masks: Masks, x: Array, u: Array) -> Prediction:
+        units, h = posterior.units, 1 / substeps
         u = u / units.control
 
         @jax.checkpoint  # the way back computes this again: cheaper than to store what it needs, stage by stage
         def rate(state: Array) -> Array:
             q, v = state
-            return jnp.stack([dt * v, units.speed * acceleration(belief, masks, q, v / units.speed, u)])
+            return jnp.stack([dt * v, units.speed * acceleration(posterior, masks, q, v / units.speed, u)])
 
         def step(now: Array) -> Array:
             """One step of the integration; its stages in a loop, because four copies take longer to compile."""
@@ -147,30 +147,34 @@ def lagrangian(
         for _ in range(substeps):
             now = step(now)
         change = jnp.zeros_like(x).at[coordinates].set(now[0] - start[0]).at[moving].set(now[1] - start[1])
-        return Prediction(change, head(belief.params["raw_std"]) * units.change)
+        return Prediction(change, head(posterior.params["raw_std"]) * units.change)
 
     mechanics = dict(turning=turning, dt=dt, substeps=substeps, activation=activation)
 
     def particles(apply: Callable[..., Prediction]) -> Callable[..., Prediction]:
         each = jax.vmap(apply, (None, 0, 0, 0))
 
-        def together(belief: Belief, masks: Masks, x: Array, u: Array) -> Prediction:
+        def together(posterior: Posterior, masks: Masks, x: Array, u: Array) -> Prediction:
             if apply is not predict or not alone_on_gpu(x):
-                return each(belief, masks, x, u)
+                return each(posterior, masks, x, u)
             from pegasus_jax.models import _lagrangian_pallas as kernel  # what it needs of JAX is for GPUs
 
             if not kernel.suits(hidden, n):
-                return each(belief, masks, x, u)
+                return each(posterior, masks, x, u)
             order = np.concatenate([coordinates, moving])
-            change = kernel.fused(lambda *arguments: each(*arguments).mean, order, **mechanics)(belief, masks, x, u)
-            return Prediction(change, jnp.broadcast_to(head(belief.params["raw_std"]) * belief.units.change, x.shape))
+            change = kernel.fused(lambda *arguments: each(*arguments).mean, order, **mechanics)(posterior, masks, x, u)
+            return Prediction(
+                change, jnp.broadcast_to(head(posterior.params["raw_std"]) * posterior.units.change, x.shape)
+            )
 
         return together
 
     def loss(params: Params, key: Key, batch: Batch, units: Units) -> Array:
         """Eq. 2 / N, but of Student's t, with fresh noise for every row; the constants have the weights' prior."""
         masks = network.sample(key, params["noise"], batch.x.shape[0])
-        predicted = jax.vmap(lambda masks, x, u: predict(Belief(params, units), masks, x, u))(masks, batch.x, batch.u)
+        predicted = jax.vmap(lambda masks, x, u: predict(Posterior(params, units), masks, x, u))(
+            masks, batch.x, batch.u
+        )
         prior = weight_decay / 2 * sum(jnp.sum(params[name] ** 2) for name in ("control", "constant", "resistance"))
         likelihood = jax.scipy.stats.t.logpdf(batch.y, DEGREES_OF_FREEDOM, predicted.mean, predicted.std)
         return -jnp.mean(jnp.sum(likelihood, -1)) + (network.penalty(params) + prior) / units.size
@@ -179,8 +183,8 @@ def lagrangian(
         init=init,
         prepare=prepare,
         loss=loss,
-        condition=lambda params, data: Belief(params, prepare(data)),
-        sample=lambda key, belief: network.sample(key, belief.params["noise"]),
+        posterior=lambda params, data: Posterior(params, prepare(data)),
+        sample=lambda key, posterior: network.sample(key, posterior.params["noise"]),
         apply=predict,
         particles=particles,
     )

@@ -76,6 +76,6 @@ def noisy(
     return Noisy(init, network.apply, sample, penalty)
 
 
-def misfit(predicted: Prediction, y: Array) -> Array:
+def nll(predicted: Prediction, y: Array) -> Array:
     """-log likelihood a row of changes y [M, D], in raw units, without its 2 pi: the first term of eq. 2 by N."""
     return jnp.mean(jnp.sum(0.5 * ((y - predicted.mean) / predicted.std) ** 2 + jnp.log(predicted.std), -1))

@@ -14,7 +14,7 @@ from pegasus_jax.pilco.kernels import Hyper, Rows, Scaling
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 
 
-class Belief(NamedTuple):
+class Posterior(NamedTuple):
     """The processes given their data, in scaled units."""
 
     hyper: Hyper
@@ -58,46 +58,46 @@ def gp(*, states: int, controls: int, angles: tuple[int, ...], features: int = 2
         h = kernels.hyper(params)
         return (kernels.penalty(h) - jnp.sum(log_evidence(h, rows))) / rows.size
 
-    def condition(params: Params, data: Dataset) -> Belief:
+    def posterior(params: Params, data: Dataset) -> Posterior:
         h, rows = kernels.hyper(params), kernels.rows_of(data, angles)
         root = jax.vmap(kernels.inverse_root)(gram(h, rows.x, rows.used))
         inverse = jnp.where(rows.used[:, None] & rows.used, jnp.swapaxes(root, 1, 2) @ root, 0)
-        return Belief(h, rows.x, rows.y, rows.used, root, solve(root, rows.y), inverse, rows.scaling)
+        return Posterior(h, rows.x, rows.y, rows.used, root, solve(root, rows.y), inverse, rows.scaling)
 
-    def sample(key: Key, belief: Belief) -> Draw:
-        h, dtype = belief.hyper, belief.x.dtype
+    def sample(key: Key, posterior: Posterior) -> Draw:
+        h, dtype = posterior.hyper, posterior.x.dtype
         wave_key, weight_key, noise_key = jax.random.split(key, 3)
         frequencies = jax.random.normal(wave_key, (states, half, width), dtype) / h.lengthscale[:, None]
         weights = h.signal[:, None] / half**0.5 * jax.random.normal(weight_key, (states, 2 * half), dtype)
-        noise = h.noise[:, None] * jax.random.normal(noise_key, belief.y.shape, dtype)
+        noise = h.noise[:, None] * jax.random.normal(noise_key, posterior.y.shape, dtype)
         # One output after the other: with many particles the features of all rows at once would fill the memory.
-        prior = jax.lax.map(lambda wave: kernels.waves(belief.x @ wave[0].T) @ wave[1], (frequencies, weights))
-        misfit = jnp.where(belief.used, belief.y - prior - noise, 0)
-        return Draw(frequencies, weights, solve(belief.root, misfit))
+        prior = jax.lax.map(lambda wave: kernels.waves(posterior.x @ wave[0].T) @ wave[1], (frequencies, weights))
+        nll = jnp.where(posterior.used, posterior.y - prior - noise, 0)
+        return Draw(frequencies, weights, solve(posterior.root, nll))
 
-    def apply(belief: Belief, draw: Draw, x: Array, u: Array) -> Prediction:
-        h, scaling = belief.hyper, belief.scaling
+    def apply(posterior: Posterior, draw: Draw, x: Array, u: Array) -> Prediction:
+        h, scaling = posterior.hyper, posterior.scaling
         z = whiten(scaling.inputs, kernels.inputs_of(x, u, angles))
         prior = jnp.einsum("em,em->e", kernels.waves(draw.frequencies @ z), draw.weights)
         # Not a product and a sum: of 200 rows and more, jaxlib 0.10 compiles those two into wrong numbers on a CPU.
-        update = jnp.einsum("en,en->e", cross(h, z, belief.x), draw.correction)
+        update = jnp.einsum("en,en->e", cross(h, z, posterior.x), draw.correction)
         return Prediction(unwhiten(scaling.targets, prior + update), h.noise * jnp.diagonal(scaling.targets.root))
 
-    def moments(belief: Belief, mean: Array, cov: Array) -> gaussian.Image:
+    def moments(posterior: Posterior, mean: Array, cov: Array) -> gaussian.Image:
         """PILCO's analytic moments. In float32 the means are good; the variances are not, and stop at 0."""
-        h = belief.hyper
+        h = posterior.hyper
         process = partial(
             gaussian.rbf_moments,
-            inputs=belief.x,
-            beta=belief.beta,
-            inverse_gram=belief.inverse,
+            inputs=posterior.x,
+            beta=posterior.beta,
+            inverse_gram=posterior.inverse,
             lengthscales=h.lengthscale,
             variance=h.signal**2,
         )
-        image = kernels.in_raw_units(process, belief.scaling)(mean, cov)
+        image = kernels.in_raw_units(process, posterior.scaling)(mean, cov)
         return image._replace(cov=image.cov + jnp.diag(jnp.maximum(-jnp.diagonal(image.cov), 0)))
 
-    whole = Dynamics(init, lambda data: kernels.rows_of(data, angles), loss, condition, sample, apply, moments)
+    whole = Dynamics(init, lambda data: kernels.rows_of(data, angles), loss, posterior, sample, apply, moments)
     return kernels.precise(whole)
 
 

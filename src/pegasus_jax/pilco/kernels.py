@@ -51,7 +51,7 @@ def inputs_of(x: Array, u: Array, angles: tuple[int, ...]) -> Array:
 
 
 def rows_of(data: Dataset, angles: tuple[int, ...]) -> Rows:
-    """The data set in scaled units. An input that has never varied is centred only: its scale is not known."""
+    """The data set in scaled units. An input that has never varied is centered only: its scale is not known."""
     raw = inputs_of(data.x, data.u, angles)
     inputs, targets = (whitener(rows, data.size, full=False) for rows in (raw, data.y))
     scale = jnp.diagonal(inputs.root)

@@ -14,11 +14,11 @@ MEMORY = 10  # past steps from which the curvature is known
 
 
 class Descent(NamedTuple):
-    """How far a minimisation got."""
+    """How far a minimization got."""
 
     params: Params  # the best there were
     value: Array  # [] theirs; infinite before the first step
-    state: Any  # of the optimiser
+    state: Any  # of the optimizer
     failures: Array  # [] int32, steps in a row without progress; it is over when they are 2
     skipped: Array  # [] int32, steps that ended where the function is not finite
     steps: Array  # [] int32 taken
@@ -61,7 +61,7 @@ def step(function: Callable[[Params], Array], d: Descent) -> tuple[Descent, tupl
     return ahead, (value, gradient)
 
 
-def minimise(function: Callable[[Params], Array], params: Params, steps: int) -> Descent:
+def minimize(function: Callable[[Params], Array], params: Params, steps: int) -> Descent:
     """At most `steps` steps from `params`; two failures in a row end the descent."""
     return jax.lax.while_loop(
         lambda d: (d.steps < steps) & (d.failures < 2), lambda d: step(function, d)[0], begin(params)
@@ -69,7 +69,7 @@ def minimise(function: Callable[[Params], Array], params: Params, steps: int) ->
 
 
 def full_data(dynamics: Dynamics, *, starts: int) -> Fitter:
-    """The fitter that minimises the loss over all rows at once, from the best of several starts.
+    """The fitter that minimizes the loss over all rows at once, from the best of several starts.
 
     The starts are the current parameters and `starts` fresh draws of `dynamics.init`. The loss must be a function of
     the parameters and of `prepare(data)` alone: it is given one key and all rows of the data set, used or not. Nothing
@@ -88,7 +88,7 @@ def full_data(dynamics: Dynamics, *, starts: int) -> Fitter:
         # One after the other: kernel matrices of all candidates at once would fill the memory.
         losses = jax.lax.map(loss, candidates)
         best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
-        found = minimise(loss, jax.tree.map(lambda leaf: leaf[best], candidates), steps)
+        found = minimize(loss, jax.tree.map(lambda leaf: leaf[best], candidates), steps)
         return Learner(found.params, learner.optimizer), FitInfo(found.value, losses[best], found.skipped)
 
     return Fitter(lambda params: (), run)

@@ -1,7 +1,7 @@
-"""PILCO's search: the expected cost of a Gaussian state propagated through policy and model, minimised by L-BFGS.
+"""PILCO's search: the expected cost of a Gaussian state propagated through policy and model, minimized by L-BFGS.
 
 Deisenroth & Rasmussen 2011; Deisenroth 2010, ch. 3. The objective is a deterministic function of policy parameters and
-belief: neither keys nor scenarios.
+posterior: neither keys nor scenarios.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ def step(
     cov: Array,
     blur: Array,
     policy_params: Params,
-    belief: Params,
+    posterior: Params,
     *,
     dynamics: Dynamics,
     policy: Policy,
@@ -47,13 +47,13 @@ def step(
     assert dynamics.moments is not None
     seen = sincos(mean, cov + jnp.diag(blur), angles)
     control = policy.moments(policy_params, seen.mean, seen.cov)
-    change = chain(partial(sincos, angles=angles), joint(lambda *_: control), partial(dynamics.moments, belief))
+    change = chain(partial(sincos, angles=angles), joint(lambda *_: control), partial(dynamics.moments, posterior))
     return residual(change)(mean, cov)
 
 
 def propagate(
     policy_params: Params,
-    belief: Params,
+    posterior: Params,
     start: tuple[Array, Array],
     std: Array,
     *,
@@ -73,7 +73,7 @@ def propagate(
     variance = jax.lax.stop_gradient(std) ** 2
 
     def advance(carry: tuple[Array, Array, Array], _: None) -> tuple[tuple[Array, Array, Array], Gaussians]:
-        image = one(*carry, policy_params, belief)
+        image = one(*carry, policy_params, posterior)
         mean, cov = image.mean, image.cov + noise.state**2 * jnp.diag(variance)
         return (mean, cov, noise.policy**2 * variance), Gaussians(mean, cov)
 
@@ -86,7 +86,7 @@ def propagate(
 
 def objective(
     policy_params: Params,
-    belief: Params,
+    posterior: Params,
     start: tuple[Array, Array],
     std: Array,
     *,
@@ -100,7 +100,7 @@ def objective(
 ) -> Array:
     """J(theta): the expected cost of the steps 1..H, [H, 1], made one number by `aggregate`."""
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, angles=angles)
-    states = propagate(policy_params, belief, start, std, horizon=horizon, noise=noise, **pieces)
+    states = propagate(policy_params, posterior, start, std, horizon=horizon, noise=noise, **pieces)
     return aggregate(jax.vmap(expected_cost)(states.mean[1:], states.cov[1:])[:, None])
 
 
@@ -109,9 +109,9 @@ def analytic(
     noise_std: Callable[[Key, Params], Array],
     restart: bool = False,
 ) -> Searcher:
-    """The searcher that minimises `objective(policy parameters, belief, std)` by L-BFGS, as far as that goes.
+    """The searcher that minimizes `objective(policy parameters, posterior, std)` by L-BFGS, as far as that goes.
 
-    `noise_std(key, belief)` is the model's noise std [D]. With `restart` a search starts from its fresh policy where
+    `noise_std(key, posterior)` is the model's noise std [D]. With `restart` a search starts from its fresh policy where
     that costs no more than the one before. A search knows nothing of the ones before: their values and
     their curvature were another model's.
     """
@@ -119,17 +119,17 @@ def analytic(
     def run(
         key: Key,
         learner: Learner,
-        belief: Params,
+        posterior: Params,
         *,
         first: Array | int,
         steps: int,
         fresh: Params | None = None,
         **_: Any,
     ) -> tuple[Learner, SearchInfo]:
-        std = noise_std(key, belief)
+        std = noise_std(key, posterior)
 
         def value(params: Params) -> Array:
-            return objective(params, belief, std)
+            return objective(params, posterior, std)
 
         def cheaper(params: Params) -> Params:
             """These, or the fresh ones where those cost no more."""

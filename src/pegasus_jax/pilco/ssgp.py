@@ -14,18 +14,18 @@ from pegasus_jax.pilco.kernels import Rows, Scaling
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 
 
-class Posterior(NamedTuple):
+class Weights(NamedTuple):
     """The weights of E outputs given their data: Gaussian with this mean, and covariance root @ root.T."""
 
     mean: Array  # [E, 2m]
     root: Array  # [E, 2m, 2m] upper triangular
 
 
-class Belief(NamedTuple):
+class Posterior(NamedTuple):
     """The model given its data, in scaled units."""
 
     frequencies: Array  # [E, m, F] rad per unit of scaled input
-    weights: Posterior
+    weights: Weights
     cov: Array  # [E, 2m, 2m] of the weights
     noise: Array  # [E]
     scaling: Scaling
@@ -35,9 +35,9 @@ def ssgp(*, states: int, controls: int, angles: tuple[int, ...], points: int = 1
     """A sparse-spectrum Gaussian process over (encoded state, control) for each dimension of the change of state.
 
     Each output is a weighted sum of the cosines and sines of `points` phases; the weights have independent Gaussian
-    priors of variance signal^2 / points, and frequencies, length scales, signal and noise maximise the evidence
+    priors of variance signal^2 / points, and frequencies, length scales, signal and noise maximize the evidence
     (Lazaro-Gredilla et al. 2010, eq. 5 to 9). As in the authors' code (docs/reference.md 6), the spectral points are
-    standard normal before length scales divide them, and their mean square is penalised: in likelihood units 2 / points
+    standard normal before length scales divide them, and their mean square is penalized: in likelihood units 2 / points
     of a standard normal prior, which holds back the frequencies that overfit. A draw is a vector of weights.
     """
     width = states + len(angles) + controls
@@ -56,33 +56,33 @@ def ssgp(*, states: int, controls: int, angles: tuple[int, ...], points: int = 1
         high = jnp.sum(jnp.mean(jnp.sum(params["points"] ** 2, -1), -1))
         return (kernels.penalty(h) + high - jnp.sum(evidence)) / rows.size
 
-    def condition(params: Params, data: Dataset) -> Belief:
+    def posterior(params: Params, data: Dataset) -> Posterior:
         h, rows, frequencies = kernels.hyper(params), kernels.rows_of(data, angles), frequencies_of(params)
-        weights = jax.vmap(posterior, (0, 0, 0, 0, None))(frequencies, h.signal, h.noise, rows.y, rows)
+        weights = jax.vmap(weights_of, (0, 0, 0, 0, None))(frequencies, h.signal, h.noise, rows.y, rows)
         cov = weights.root @ jnp.swapaxes(weights.root, 1, 2)
-        return Belief(frequencies, weights, cov, h.noise, rows.scaling)
+        return Posterior(frequencies, weights, cov, h.noise, rows.scaling)
 
-    def sample(key: Key, belief: Belief) -> Array:
+    def sample(key: Key, posterior: Posterior) -> Array:
         """Weights [E, 2m] of one function."""
-        mean, root = belief.weights
+        mean, root = posterior.weights
         return mean + jnp.einsum("eij,ej->ei", root, jax.random.normal(key, mean.shape, mean.dtype))
 
-    def apply(belief: Belief, draw: Array, x: Array, u: Array) -> Prediction:
-        inputs, targets = belief.scaling
+    def apply(posterior: Posterior, draw: Array, x: Array, u: Array) -> Prediction:
+        inputs, targets = posterior.scaling
         z = whiten(inputs, kernels.inputs_of(x, u, angles))
-        change = jnp.sum(kernels.waves(belief.frequencies @ z) * draw, -1)
-        return Prediction(unwhiten(targets, change), belief.noise * jnp.diagonal(targets.root))
+        change = jnp.sum(kernels.waves(posterior.frequencies @ z) * draw, -1)
+        return Prediction(unwhiten(targets, change), posterior.noise * jnp.diagonal(targets.root))
 
-    def moments(belief: Belief, mean: Array, cov: Array) -> gaussian.Image:
+    def moments(posterior: Posterior, mean: Array, cov: Array) -> gaussian.Image:
         process = partial(
             gaussian.ssgp_moments,
-            frequencies=belief.frequencies,
-            weight_mean=belief.weights.mean,
-            weight_cov=belief.cov,
+            frequencies=posterior.frequencies,
+            weight_mean=posterior.weights.mean,
+            weight_cov=posterior.cov,
         )
-        return kernels.in_raw_units(process, belief.scaling)(mean, cov)
+        return kernels.in_raw_units(process, posterior.scaling)(mean, cov)
 
-    whole = Dynamics(init, lambda data: kernels.rows_of(data, angles), loss, condition, sample, apply, moments)
+    whole = Dynamics(init, lambda data: kernels.rows_of(data, angles), loss, posterior, sample, apply, moments)
     return kernels.precise(whole)
 
 
@@ -96,18 +96,18 @@ def design(frequencies: Array, signal: Array, noise: Array, rows: Rows) -> tuple
     return features, features.T @ features + jnp.eye(features.shape[1], dtype=features.dtype)
 
 
-def posterior(frequencies: Array, signal: Array, noise: Array, y: Array, rows: Rows) -> Posterior:
+def weights_of(frequencies: Array, signal: Array, noise: Array, y: Array, rows: Rows) -> Weights:
     """The weights of one output, of frequencies [m, F] and targets y [N]."""
     features, precision = design(frequencies, signal, noise, rows)
     scale = signal / frequencies.shape[0] ** 0.5
     root = kernels.inverse_root(precision)
-    return Posterior(scale * (root.T @ (root @ (features.T @ (y / noise)))), scale * root.T)
+    return Weights(scale * (root.T @ (root @ (features.T @ (y / noise)))), scale * root.T)
 
 
 def log_evidence(frequencies: Array, signal: Array, noise: Array, y: Array, rows: Rows) -> Array:
     """log p(y | x) of one output (Lazaro-Gredilla et al. 2010, eq. 8).
 
-    The quadratic form y' (noise^2 I + features features')^-1 y is taken as the least penalised square error: a sum of
+    The quadratic form y' (noise^2 I + features features')^-1 y is taken as the least penalized square error: a sum of
     squares, where the usual difference cancels all digits when the noise is low. At its minimum the weights' own
     dependence on the hyperparameters is of no account, so no gradient need flow through their solution; and that of
     the determinant is written down, carried by a product that is zero.

@@ -24,7 +24,7 @@ def mlp(
 ) -> Policy:
     """u = saturate(network(encode(x) * input_scale)); noise is on each hidden layer's output (docs/reference.md 5.1).
 
-    What the data have large is standardised on its way in, see `scaled`.
+    What the data have large is standardized on its way in, see `scaled`.
     """
     network = MLP(hidden, controls, initialiser)
 

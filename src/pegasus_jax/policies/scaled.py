@@ -1,4 +1,4 @@
-"""A controller's inputs, standardised where the data have them so large that they would saturate it."""
+"""A controller's inputs, standardized where the data have them so large that they would saturate it."""
 
 from typing import NamedTuple
 

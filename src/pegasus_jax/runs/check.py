@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import tasks
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config
 from pegasus_jax.tasks import cost_check, user_code
 from pegasus_jax.types import Task
@@ -19,7 +19,7 @@ EXACT = 1e-4  # of an entry's spread: what is left of it is rounding
 def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     """Notes on a task of the user's, one line each; opens its environment and resets it so many times.
 
-    Raises SettingError, in one line, for a cost that cannot be learned from and readings that cannot be right. The cost
+    Raises ConfigError, in one line, for a cost that cannot be learned from and readings that cannot be right. The cost
     is looked at first: a mistake in it moves no robot.
     """
     if config.task not in (tasks.GYM, tasks.MJCF):
@@ -42,22 +42,22 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
 
 
 def stopping(config: Config, task: Task) -> None:
-    """Raises SettingError unless the task's `stop` is one probability, and its episodes do not end where they start."""
+    """Raises ConfigError unless the task's `stop` is one probability, and its episodes do not end where they start."""
     if task.stop is None:
         return
     what = f"stop={config.stop}"
     with user_code.blamed(what, task.stop):
         value = jnp.asarray(task.stop(jnp.asarray(task.start_mean, float)))
     if value.shape != ():
-        raise SettingError(f"{what} returns an array of shape {value.shape}; expected one number in [0, 1], or a bool")
+        raise ConfigError(f"{what} returns an array of shape {value.shape}; expected one number in [0, 1], or a bool")
     if not 0 <= float(value) <= 1:
-        raise SettingError(f"{what} is {float(value):g} at the start; expected a probability in [0, 1], or a bool")
+        raise ConfigError(f"{what} is {float(value):g} at the start; expected a probability in [0, 1], or a bool")
     if float(value) > 0.5:
-        raise SettingError(f"{what} is {float(value):g} at the start: every episode would end there")
+        raise ConfigError(f"{what} is {float(value):g} at the start: every episode would end there")
 
 
 def plausible(readings: np.ndarray, facts: cost_check.Facts) -> list[str]:
-    """Notes on angles that are large for radians. Raises SettingError for those that must be degrees.
+    """Notes on angles that are large for radians. Raises ConfigError for those that must be degrees.
 
     readings: [N, D] of resets
     """
@@ -67,7 +67,7 @@ def plausible(readings: np.ndarray, facts: cost_check.Facts) -> list[str]:
         largest = float(max(seen, key=abs))
         text = f"angles=[{entry}]: x{entry} is {largest:.4g} at the start"
         if abs(largest) > 4 * np.pi:
-            raise SettingError(f"{text}, more than two turns in radians; degrees? Return np.deg2rad of it")
+            raise ConfigError(f"{text}, more than two turns in radians; degrees? Return np.deg2rad of it")
         if abs(largest) > 2 * np.pi:
             notes.append(f"{text}, more than a turn in radians; are these degrees?")
     return notes
@@ -107,7 +107,7 @@ def _explained(column: np.ndarray, others: dict[str, np.ndarray]) -> str:
 def report(config: Config) -> list[str]:
     """What a task is like, line by line. Its environment is opened, reset, not driven, and closed.
 
-    Raises SettingError, in one line, for what cannot be learned.
+    Raises ConfigError, in one line, for what cannot be learned.
     """
     from pegasus_jax.builder import build, set_precision
 

@@ -62,7 +62,7 @@ def damage(run: Path, trial: int) -> str | None:
 def restore(run: Path, trial: int, like: RunState) -> RunState:
     """The state after a trial; `like` is a state of the same experiment (shapes are enough: eval_shape of init).
 
-    The data may have fewer rows than in `like`. An optimiser is None where it is that of other settings. Raises
+    The data may have fewer rows than in `like`. An optimizer is None where it is that of other settings. Raises
     RunError, naming the difference, when the rest is the state of another experiment or version.
     """
     folder, like = _folder(run, trial), jax.eval_shape(_plain, like)

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from pegasus_jax.checks import SettingError, called, nearest, shown
+from pegasus_jax.checks import ConfigError, called, nearest, shown
 from pegasus_jax.config import KINDS, TASKS, Config
 from pegasus_jax.presets import WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
@@ -23,17 +23,17 @@ NAMED: dict[str, Any] = {"task": TASKS, **WORDS}
 
 
 def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, str], dict[str, str]]:
-    """(options, settings) of `key=value` words. Raises SettingError for a word that is not of that form."""
+    """(options, settings) of `key=value` words. Raises ConfigError for a word that is not of that form."""
     known, rest = {}, {}
     for word in words:
         key, equals, value = word.partition("=")
         if not equals or not key:
             if any(part.startswith("=") or part.endswith("=") for part in words):
-                raise SettingError(
+                raise ConfigError(
                     f"'{word}' is not of the form key=value; write no spaces around =, as in task=cartpole"
                 )
             choices = [*options, *NAMED, *leaves(Config())]
-            raise SettingError(f"'{word}' is not of the form key=value; {_hint(word.lstrip('-'), choices)}")
+            raise ConfigError(f"'{word}' is not of the form key=value; {_hint(word.lstrip('-'), choices)}")
         (known if key in options else rest)[key] = value
     return known, rest
 
@@ -44,7 +44,7 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     chosen = {name: words.pop(name) for name in NAMED if name in words}
     for name, value in chosen.items():
         if value not in NAMED[name]:
-            raise SettingError(f"{name}={value} is unknown; {nearest(value, NAMED[name])}")
+            raise ConfigError(f"{name}={value} is unknown; {nearest(value, NAMED[name])}")
     given = {key: words[key] for key in ("legs",) if key in words}
     task, begin = chosen.pop("task", None), chosen.pop("preset", None)
     if begin is None:
@@ -52,20 +52,20 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
         begin = own(task, override(Config(task=task), values(given)).legs if task in used_by()["legs"] else Config.legs)
     config = preset(begin, **chosen)
     if task not in (None, config.task):
-        raise SettingError(f"preset={begin} is for task={config.task}, not task={task}; the nearest is preset={task}")
+        raise ConfigError(f"preset={begin} is for task={config.task}, not task={task}; the nearest is preset={task}")
     known, of_some = leaves(config), used_by()
     for key in words:
         refuse(key)
         if key not in known:
-            raise SettingError(f"{key} is not a setting; {_hint(key, [*known, *NAMED, *options])}")
+            raise ConfigError(f"{key} is not a setting; {_hint(key, [*known, *NAMED, *options])}")
         if config.task not in of_some.get(key, (config.task,)):
-            raise SettingError(
+            raise ConfigError(
                 f"{key}={shown(words[key])} is of no use with task={config.task}; the nearest task that uses it is"
                 f" task={_nearest_of(config.task, of_some[key])}"
             )
     changed = override(config, values(words))
     if changed.legs != config.legs:
-        raise SettingError(f"preset={begin} is for legs={config.legs}; with legs={changed.legs} leave out preset=")
+        raise ConfigError(f"preset={begin} is for legs={config.legs}; with legs={changed.legs} leave out preset=")
     return changed
 
 
@@ -102,7 +102,7 @@ def override(config: Config, changes: dict[str, Any]) -> Config:
     for key in changes:
         refuse(key)
         if key not in known:
-            raise SettingError(f"{key} is not a setting; {_hint(key, [*known])}")
+            raise ConfigError(f"{key} is not a setting; {_hint(key, [*known])}")
     return _changed(config, changes, "")
 
 
@@ -142,32 +142,32 @@ def save(config: Config, path: Path) -> None:
 
 
 def load(path: Path) -> Config:
-    """The config that `save` wrote. Raises SettingError when it is not one."""
+    """The config that `save` wrote. Raises ConfigError when it is not one."""
     try:
         stored: Any = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
     except (OSError, ValueError, RecursionError, OmegaConfBaseException, YAMLError) as error:
-        raise SettingError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
+        raise ConfigError(f"{path} cannot be read: {' '.join(str(error).split())}") from error
     if not isinstance(stored, dict) or "task" not in stored:
-        raise SettingError(f"{path} is not the config of a run")
+        raise ConfigError(f"{path} is not the config of a run")
     try:
         return stored_config({str(key): value for key, value in stored.items()})
-    except SettingError as error:
-        raise SettingError(f"{path}: {error}") from error
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from error
 
 
 def stored_config(stored: dict[str, Any]) -> Config:
-    """The config of which `plain` was kept. Raises SettingError for a name or a value that no setting has.
+    """The config of which `plain` was kept. Raises ConfigError for a name or a value that no setting has.
 
     A setting that is not there is younger than what was kept, and its default leaves everything as it was.
     """
     chosen = {section: stored.get(f"{section}.kind") for section in KINDS}
     for section, kind in chosen.items():
         if kind not in (None, *KINDS[section]):
-            raise SettingError(f"{section}.kind={kind} is unknown; {nearest(kind, KINDS[section])}")
+            raise ConfigError(f"{section}.kind={kind} is unknown; {nearest(kind, KINDS[section])}")
     config = Config(**{section: KINDS[section][kind] for section, kind in chosen.items() if kind is not None})
     stored = without(stored)
     if wrong := sorted(set(stored) - set(leaves(config))):
-        raise SettingError(f"not the config of a run of this version: see {', '.join(wrong[:5])}")
+        raise ConfigError(f"not the config of a run of this version: see {', '.join(wrong[:5])}")
     return override(config, stored)
 
 
@@ -181,7 +181,7 @@ def _value(key: str, text: str) -> Any:
     try:
         return OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]))["value"]  # type: ignore[index,call-overload]
     except Exception as error:
-        raise SettingError(f"{key}={shown(text)} cannot be read as a value") from error
+        raise ConfigError(f"{key}={shown(text)} cannot be read as a value") from error
 
 
 def _changed(node: Any, changes: dict[str, Any], prefix: str) -> Any:
@@ -201,7 +201,7 @@ def _changed(node: Any, changes: dict[str, Any], prefix: str) -> Any:
 def _converted(node: Any, name: str, value: Any, key: str) -> Any:
     """The value as the type of the dataclass's field of that name."""
     if "${" in str(value):  # OmegaConf would put another setting there, or a variable of the environment
-        raise SettingError(f"{key}={shown(value)} is not a value but a reference to one; write the value itself")
+        raise ConfigError(f"{key}={shown(value)} is not a value but a reference to one; write the value itself")
     current = getattr(node, name)
     field = next(f for f in dataclasses.fields(node) if f.name == name)
     schema = OmegaConf.structured(dataclasses.make_dataclass("One", [(name, field.type, current)]))
@@ -210,6 +210,6 @@ def _converted(node: Any, name: str, value: Any, key: str) -> Any:
         assert isinstance(merged, DictConfig)
         return getattr(OmegaConf.to_object(merged), name)
     except (OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
-        raise SettingError(
+        raise ConfigError(
             f"{key}={shown(value)} is not {called(field.type)}; for example {key}={shown(current)}"
         ) from error

@@ -29,7 +29,7 @@ PHASES = {
 PARTS = {
     "init": "the start",
     "episode": "the episode",
-    "absorb": "the data set",
+    "add_episode": "the data set",
     "fit": "the fit",
     "search": "the search",
     "succeed": "the imagined rollouts",

@@ -96,7 +96,7 @@ class Program:
             "init": (experiment.init, (0,)),
             "episode": (experiment.episode, (0, 0, None)),
             "evaluate": (jax.vmap(experiment.episode, (0, None, None)), (0, 0, None)),
-            "absorb": (experiment.absorb, (0, 0)),
+            "add_episode": (experiment.add_episode, (0, 0)),
             "fit": (experiment.fit, (0,)),
             "search": (partial(experiment.search, steps=self.chunk), (0, None)),
             "succeed": (experiment.succeed, (0, 0)),

@@ -2,7 +2,7 @@
 
 from typing import Any, NamedTuple
 
-from pegasus_jax.checks import SettingError, shown
+from pegasus_jax.checks import ConfigError, shown
 
 
 class Removed(NamedTuple):
@@ -33,16 +33,16 @@ REMOVED = {
 
 
 def refuse(key: str) -> None:
-    """Raises SettingError for a word of the command line that names a removed setting."""
+    """Raises ConfigError for a word of the command line that names a removed setting."""
     if key in REMOVED:
-        raise SettingError(f"{key} was removed; instead: {REMOVED[key].instead}")
+        raise ConfigError(f"{key} was removed; instead: {REMOVED[key].instead}")
 
 
 def without(stored: dict[str, Any]) -> dict[str, Any]:
-    """A stored config without what was removed since. Raises SettingError where that had another value than today's."""
+    """A stored config without what was removed since. Raises ConfigError where that had another value than today's."""
     for key, value in stored.items():
         if key in REMOVED and value != REMOVED[key].always:
-            raise SettingError(
+            raise ConfigError(
                 f"{key}={shown(value)} was removed, only {shown(REMOVED[key].always)} is left;"
                 f" an earlier version of pegasus_jax reads this run"
             )

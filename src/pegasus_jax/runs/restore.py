@@ -19,7 +19,7 @@ import numpy as np
 
 from pegasus_jax import tasks
 from pegasus_jax.builder import compose, set_precision
-from pegasus_jax.checks import RunError, SettingError
+from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
 from pegasus_jax.episode import verdict
 from pegasus_jax.runs import checkpoint, config_io, facts, store
@@ -101,7 +101,7 @@ def newest(runs: Sequence[Path], like: RunState, candidates: Sequence[int]) -> t
 
 
 def _stacked(states: Sequence[RunState]) -> RunState:
-    """One state [S, ...] of many; an optimiser that one of them lacks, all lack."""
+    """One state [S, ...] of many; an optimizer that one of them lacks, all lack."""
 
     def learner(name: str, state: RunState) -> Learner:
         lacking = any(getattr(other, name).optimizer is None for other in states)
@@ -135,7 +135,7 @@ def together(runs: Sequence[Path], experiment: Experiment, say: Callable[[str], 
 
 
 def suited(states: RunState, fresh: RunState) -> RunState:
-    """The states, with fresh optimisers where the settings ask for others than the run had so far."""
+    """The states, with fresh optimizers where the settings ask for others than the run had so far."""
 
     def shape(tree: Any) -> tuple[Any, list[Any]]:
         return jax.tree.structure(tree), jax.tree.map(jnp.shape, jax.tree.leaves(tree))
@@ -170,10 +170,10 @@ def planted(run: Path, config: Config) -> Task:
 def moved(run: Path, config: Config, mjcf: str | None = None) -> Config:
     """The config with the model's file where it is now: `mjcf`, where it was, or of that name in the working folder.
 
-    That it is the same model is seen when it is read. Raises RunError, or SettingError for a task without such a file.
+    That it is the same model is seen when it is read. Raises RunError, or ConfigError for a task without such a file.
     """
     if mjcf is not None and config.task != tasks.MJCF:
-        raise SettingError(f"mjcf={mjcf} is of no use here: the run is of task={config.task}")
+        raise ConfigError(f"mjcf={mjcf} is of no use here: the run is of task={config.task}")
     if mjcf is None and (config.task != tasks.MJCF or config.mjcf is None or Path(config.mjcf).is_file()):
         return config
     file = Path(mjcf or Path(config.mjcf or "").name)

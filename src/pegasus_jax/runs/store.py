@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from filelock import FileLock, Timeout
 
-from pegasus_jax.checks import RunError, SettingError
+from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.runs import facts
 from pegasus_jax.runs.files import strict, write_json, write_whole
 from pegasus_jax.runs.machine import about
@@ -46,24 +46,24 @@ COLUMNS = ("plant_seconds", "episode_cost", "mean_cost", "success_rate", "object
 
 
 def create(path: Path) -> Path:
-    """A new run's folder. Raises SettingError when it cannot be made or holds a run already."""
+    """A new run's folder. Raises ConfigError when it cannot be made or holds a run already."""
     _unused(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass
     except OSError as error:
-        raise SettingError(f"out={path} cannot be written: {error.strerror}; for example out=runs/demo") from error
+        raise ConfigError(f"out={path} cannot be written: {error.strerror}; for example out=runs/demo") from error
     return path
 
 
 def _unused(path: Path) -> None:
-    """Raises SettingError for a folder that holds a run, or what is left of one."""
+    """Raises ConfigError for a folder that holds a run, or what is left of one."""
     if (path / "config.yaml").exists():
-        raise SettingError(f"out={path} holds a run already; resume={path} goes on with it, out={free(path)} is free")
+        raise ConfigError(f"out={path} holds a run already; resume={path} goes on with it, out={free(path)} is free")
     for name in ("episodes", "checkpoints", "trials.jsonl"):
         if (path / name).exists():
-            raise SettingError(f"out={path} holds {name} of a run without its config.yaml; out={free(path)} is free")
+            raise ConfigError(f"out={path} holds {name} of a run without its config.yaml; out={free(path)} is free")
 
 
 def existing(path: Path) -> Path:
@@ -100,7 +100,7 @@ def lock(path: Path, *, new: bool = False) -> FileLock:
     """The right to write to a run, held until released. Raises RunError when another process has it.
 
     Of a `new` run the folder must be unused; that is looked at under the lock, so that of two processes that begin in
-    one folder, one gets it. SettingError tells the other.
+    one folder, one gets it. ConfigError tells the other.
     """
     guard = FileLock(path / ".lock")
     try:

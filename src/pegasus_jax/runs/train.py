@@ -15,7 +15,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from pegasus_jax import episode
-from pegasus_jax.checks import RunError, SettingError
+from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import EVALUATE, trial_key
 from pegasus_jax.runs import checkpoint, config_io, restore, store, writers
@@ -74,7 +74,7 @@ def train_seeds(
             store.remove_unfinished(run)
         before = config_io.load(folders[0] / "config.yaml") if resume else config
         if config.trials < before.trials:
-            raise SettingError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
+            raise ConfigError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
         job = held.enter_context(opened(config, list(runs), mesh))
         task, say = job.experiment.task, job.display.line
         for run in folders if resume else ():
@@ -117,7 +117,7 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Ro
     judged = trial > max(1, config.explore.trials)
     calibration = fetched(program("calibrate", states, trajectories)) if judged else np.full(len(episodes), np.nan)
     # Line 4: add the episode to the data.
-    states, found = program("absorb", states, trajectories), [UNKNOWN] * len(episodes)
+    states, found = program("add_episode", states, trajectories), [UNKNOWN] * len(episodes)
     # Lines 5 and 6: fit the model, search a policy; not where the next episode is random too, and needs no policy.
     if trial >= config.explore.trials:
         states, found = improved(job, states, trial, trajectories)

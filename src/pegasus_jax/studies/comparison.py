@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from pegasus_jax.builder import build
-from pegasus_jax.checks import RunError, SettingError, nearest
+from pegasus_jax.checks import ConfigError, RunError, nearest
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
@@ -25,7 +25,7 @@ OPTIONS = ("out", "seeds", "variants")  # of pegasus-figures; other words are se
 
 
 def configs(figure: Figure, changes: Sequence[str] = ()) -> dict[str, Config]:
-    """The config of each variant, `changes` (words of a command line) in all of them. Raises SettingError, naming it.
+    """The config of each variant, `changes` (words of a command line) in all of them. Raises ConfigError, naming it.
 
     Later words win: the figure's trials, what is common, the variant's own, `changes`.
     """
@@ -36,8 +36,8 @@ def configs(figure: Figure, changes: Sequence[str] = ()) -> dict[str, Config]:
             config = config_io.parse(config_io.split(words)[1], options=OPTIONS)
             with jax.enable_x64(config.precision == "double"):
                 build(config)  # so that impossible settings end here, before an hour's work
-        except ValueError as error:  # a SettingError is one
-            raise SettingError(f"figure {figure.name}, variant {label}: {error}") from error
+        except ValueError as error:  # a ConfigError is one
+            raise ConfigError(f"figure {figure.name}, variant {label}: {error}") from error
         found[label] = config
     return found
 
@@ -47,16 +47,16 @@ def run(
 ) -> dict[str, Result]:
     """Run the variants (those of `only`, or all) whose study is not in `out` yet; the studies that are there then.
 
-    Raises SettingError for an impossible one before the first is run.
+    Raises ConfigError for an impossible one before the first is run.
     """
     for label in only:
         if label not in figure.variants:
-            raise SettingError(f"{label} is not a variant of figure {figure.name}; {nearest(label, figure.variants)}")
+            raise ConfigError(f"{label} is not a variant of figure {figure.name}; {nearest(label, figure.variants)}")
     chosen, wanted = seed_list(seeds or figure.seeds), configs(figure, changes)
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise SettingError(f"out={out} cannot be written: {error.strerror}") from error
+        raise ConfigError(f"out={out} cannot be written: {error.strerror}") from error
     for label in only or figure.variants:
         if stored(out, f"{figure.name}-{label}") is None:
             path = out / f"{figure.name}-{label}.json"

@@ -24,7 +24,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.checks import ConfigError, nearest
 
 
 class Claim(NamedTuple):
@@ -67,29 +67,29 @@ KINDS: dict[str, type] = {
 
 
 def read(path: Path) -> Figure:
-    """The figure of a file. Raises SettingError, in one line, for a file that is not one."""
+    """The figure of a file. Raises ConfigError, in one line, for a file that is not one."""
     try:
         said = tomllib.loads(path.read_text())
     except OSError as error:
         near = nearest(path.stem, [p.stem for p in sorted(path.parent.glob("*.toml"))]) if path.parent.is_dir() else ""
-        raise SettingError(f"{path} cannot be read: {error.strerror}" + (f"; {near}" if near else "")) from error
+        raise ConfigError(f"{path} cannot be read: {error.strerror}" + (f"; {near}" if near else "")) from error
     except ValueError as error:
-        raise SettingError(f"{path} is not TOML: {error}") from error
+        raise ConfigError(f"{path} is not TOML: {error}") from error
     for key, value in said.items():
         if key not in KINDS:
-            raise SettingError(f"{path}: {key} is not a key of a figure; {nearest(key, KINDS)}")
+            raise ConfigError(f"{path}: {key} is not a key of a figure; {nearest(key, KINDS)}")
         if not isinstance(value, KINDS[key]) or isinstance(value, bool):
-            raise SettingError(f"{path}: {key}={value} is not {_article(KINDS[key])}")
+            raise ConfigError(f"{path}: {key}={value} is not {_article(KINDS[key])}")
     for key in NEEDED:
         if not said.get(key):
-            raise SettingError(f"{path}: {key} is missing")
+            raise ConfigError(f"{path}: {key} is missing")
     for label, words in said["variants"].items():
         if not isinstance(words, str):
-            raise SettingError(f'{path}: variant {label} is not a text of settings; for example "search.clip=1"')
+            raise ConfigError(f'{path}: variant {label} is not a text of settings; for example "search.clip=1"')
         if not re.fullmatch(r"[\w.-]+", label):
-            raise SettingError(f"{path}: variant '{label}' cannot be part of a file's name; letters, digits, . _ -")
+            raise ConfigError(f"{path}: variant '{label}' cannot be part of a file's name; letters, digits, . _ -")
     if said.get("picture", "curves") not in PICTURES:
-        raise SettingError(f"{path}: picture={said['picture']} is unknown; {nearest(said['picture'], PICTURES)}")
+        raise ConfigError(f"{path}: picture={said['picture']} is unknown; {nearest(said['picture'], PICTURES)}")
     claims = tuple(_claim(path, claim) for claim in said.get("claims", ()))
     fields: dict[str, Any] = (
         dict(paper="", found="", seeds="0-9", picture="curves", common="") | said | {"claims": claims}
@@ -100,16 +100,14 @@ def read(path: Path) -> Figure:
 def _claim(path: Path, said: Any) -> Claim:
     fields = Claim._fields
     if not isinstance(said, dict) or {*said} != {*fields}:
-        raise SettingError(f"{path}: a claim has {', '.join(fields)}; this one has {', '.join(said) or 'nothing'}")
+        raise ConfigError(f"{path}: a claim has {', '.join(fields)}; this one has {', '.join(said) or 'nothing'}")
     span = said["trials"]
     if not (
         isinstance(span, list) and len(span) == 2 and all(isinstance(t, int) for t in span) and 1 <= span[0] <= span[1]
     ):
-        raise SettingError(f"{path}: a claim's trials={span} are not first and last; for example [1, 15]")
+        raise ConfigError(f"{path}: a claim's trials={span} are not first and last; for example [1, 15]")
     if not (isinstance(said["than"], str | float | int) and isinstance(said["lower"], str)):
-        raise SettingError(
-            f"{path}: a claim's lower is a variant, its than a variant or a number: see '{said['says']}'"
-        )
+        raise ConfigError(f"{path}: a claim's lower is a variant, its than a variant or a number: see '{said['says']}'")
     return Claim(said["says"], said["lower"], said["than"], (span[0], span[1]))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pegasus_jax import sharding
-from pegasus_jax.checks import SIZES, SettingError
+from pegasus_jax.checks import SIZES, ConfigError
 from pegasus_jax.config import GYM, Config
 from pegasus_jax.runs import config_io, writers
 from pegasus_jax.runs.files import write_whole
@@ -28,14 +28,12 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
     """Curves [S, T] of a configuration over seeds; written to `path` after every trial, so that nothing is lost.
 
     The seeds learn what `pegasus-train` would learn with them (runs/train.py); `curves` says what is kept. Raises
-    SettingError for a plant that cannot be vmapped.
+    ConfigError for a plant that cannot be vmapped.
     """
     if config.task == GYM:
-        raise SettingError(
-            "task=gym cannot be studied as one program: its environment is one object; use pegasus-train"
-        )
+        raise ConfigError("task=gym cannot be studied as one program: its environment is one object; use pegasus-train")
     if not config.evaluation:
-        raise SettingError("evaluation=0 leaves a study nothing to compare; the nearest is 1")
+        raise ConfigError("evaluation=0 leaves a study nothing to compare; the nearest is 1")
     result: dict[str, Any] = {}
 
     def keep(latest: dict[str, Any]) -> None:
@@ -113,7 +111,7 @@ def table(result: dict[str, Any]) -> str:
 
 
 def seed_list(text: str) -> list[int]:
-    """Seeds of '0-9' or '0,3,7'. Raises SettingError for anything else."""
+    """Seeds of '0-9' or '0,3,7'. Raises ConfigError for anything else."""
     first, dash, last = text.partition("-")
     try:
         seeds = (
@@ -124,7 +122,7 @@ def seed_list(text: str) -> list[int]:
     except ValueError:
         seeds = []
     if not seeds or min(seeds) < 0 or len(seeds) > SIZES["trials"]:
-        raise SettingError(
+        raise ConfigError(
             f"seeds={text} names no seeds, or more than {SIZES['trials']:,}; for example seeds=0-9 or seeds=0,3,7"
         )
     return seeds

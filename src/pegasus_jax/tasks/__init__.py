@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pegasus_jax import interrupt
-from pegasus_jax.checks import SettingError, nearest
-from pegasus_jax.config import GYM, MANOEUVRES, MJCF, Config
+from pegasus_jax.checks import ConfigError, nearest
+from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
 from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
 from pegasus_jax.tasks import user_code
 from pegasus_jax.types import Task
@@ -57,24 +57,24 @@ def _double_cartpole(_: Any) -> "Plant":
     return double_cartpole()
 
 
-def _swimmer(manoeuvre: Any, legs: Any) -> "Plant":
+def _swimmer(maneuver: Any, legs: Any) -> "Plant":
     from pegasus_envs.swimmer.plant import swimmer
 
-    return swimmer(manoeuvre, legs)
+    return swimmer(maneuver, legs)
 
 
 # Name -> the plant, given how many of its legs a swimmer drives.
 TASKS: dict[str, Callable[[Any], "Plant"]] = {
     "cartpole": _cartpole,
     "double_cartpole": _double_cartpole,
-    **{f"swimmer_{manoeuvre}": partial(_swimmer, manoeuvre) for manoeuvre in MANOEUVRES},
+    **{f"swimmer_{maneuver}": partial(_swimmer, maneuver) for maneuver in MANEUVERS},
 }
 
 
 def make(name: str, legs: int = 2) -> Task:
-    """The task of that name; only the swimmer has legs. Raises SettingError for an unknown one."""
+    """The task of that name; only the swimmer has legs. Raises ConfigError for an unknown one."""
     if name not in TASKS:
-        raise SettingError(f"task={name} is unknown; {nearest(name, TASKS)}")
+        raise ConfigError(f"task={name} is unknown; {nearest(name, TASKS)}")
     return of_plant(name, TASKS[name](legs))
 
 
@@ -85,10 +85,10 @@ def of_config(config: Config) -> Task:
 
 
 def rates_of(task: Task) -> tuple[int, ...]:
-    """The entries of a task's state that are rates of the others. Raises SettingError where they are not known."""
+    """The entries of a task's state that are rates of the others. Raises ConfigError where they are not known."""
     states = len(task.state_names)
     if 2 * len(set(task.rates)) != states or set(task.rates) & set(task.angles):
-        raise SettingError(
+        raise ConfigError(
             f"model=lagrangian needs a state of coordinates and their rates, and that of task={task.name} is not known"
             " to be one; the nearest is model=log_normal"
         )
@@ -96,9 +96,9 @@ def rates_of(task: Task) -> tuple[int, ...]:
 
 
 def known_sensors(task: Task) -> np.ndarray:
-    """The std [D] of a task's sensors. Raises SettingError where it is not known."""
+    """The std [D] of a task's sensors. Raises ConfigError where it is not known."""
     if not np.any(task.sensor_std):
-        raise SettingError(
+        raise ConfigError(
             f"search.sensors=known needs a plant whose sensors' noise is known, and that of task={task.name} is not;"
             " the nearest is search.sensors=predicted"
         )
@@ -108,11 +108,11 @@ def known_sensors(task: Task) -> np.ndarray:
 def input_scale(task: Task, units: tuple[float, ...]) -> Any:
     """What a policy's features [F] are multiplied by, so that it counts in these units; 1 for none.
 
-    Raises SettingError where they are not one for each state that is no angle.
+    Raises ConfigError where they are not one for each state that is no angle.
     """
     names = [name for i, name in enumerate(task.state_names) if i not in task.angles]
     if units and len(units) != len(names):
-        raise SettingError(f"policy.input_units={list(units)} must be {len(names)} numbers, of {', '.join(names)}")
+        raise ConfigError(f"policy.input_units={list(units)} must be {len(names)} numbers, of {', '.join(names)}")
     return np.concatenate([1 / np.array(units), np.ones(2 * len(task.angles))]) if units else 1.0
 
 
@@ -131,11 +131,11 @@ def pinned(config: Config) -> Config:
         try:
             known = env_spec(config.env or "", config.env_args, **given)
         except ValueError as error:
-            raise SettingError(f"env={config.env}: {' '.join(str(error).split())}") from error
+            raise ConfigError(f"env={config.env}: {' '.join(str(error).split())}") from error
         except KeyboardInterrupt:
             raise
         except BaseException as error:
-            raise SettingError(f"env={config.env}: {user_code.told(error)}") from error
+            raise ConfigError(f"env={config.env}: {user_code.told(error)}") from error
         plain = {
             name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known._asdict().items()
         }
@@ -146,7 +146,7 @@ def pinned(config: Config) -> Config:
 
 
 def of_gym(config: Config) -> Task:
-    """The task that a Gymnasium environment and a cost of its observations pose. Raises SettingError if they cannot."""
+    """The task that a Gymnasium environment and a cost of its observations pose. Raises ConfigError if they cannot."""
     from pegasus_envs.gym_plant import EnvSpec, env_plant
 
     _complete(config)
@@ -179,9 +179,9 @@ def close(task: Task) -> None:
 
 
 def _complete(config: Config) -> None:
-    """Raises SettingError unless an environment is named, and a cost that there is: no robot is opened in vain."""
+    """Raises ConfigError unless an environment is named, and a cost that there is: no robot is opened in vain."""
     if config.env is None or config.cost is None:
-        raise SettingError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
+        raise ConfigError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
     user_code.load("cost", config.cost)
     module, colon, _ = config.env.partition(":")
     if colon:  # Gymnasium imports it, to register what is in it
@@ -199,7 +199,7 @@ def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarr
 def readings(config: Config, task: Task, resets: int) -> np.ndarray:
     """What an environment observes after so many resets [N, D]; N is 0 for a simulation of our own.
 
-    Raises SettingError, in one line, for what the environment raises.
+    Raises ConfigError, in one line, for what the environment raises.
     """
     if config.task != GYM:
         return np.zeros((0, len(task.state_names)))
@@ -210,14 +210,14 @@ def readings(config: Config, task: Task, resets: int) -> np.ndarray:
 
 
 def compared(config: Config, task: Task) -> None:
-    """Raises SettingError, in one line, where MJX does not simulate a task's MJCF file as MuJoCo does."""
+    """Raises ConfigError, in one line, where MJX does not simulate a task's MJCF file as MuJoCo does."""
     if config.task == MJCF:
         from pegasus_envs import mjcf_check
 
         try:
             mjcf_check.compare(task.plant)
         except ValueError as error:
-            raise SettingError(f"mjcf={config.mjcf}: {error}") from error
+            raise ConfigError(f"mjcf={config.mjcf}: {error}") from error
 
 
 def described(config: Config) -> dict[str, str]:
@@ -236,7 +236,7 @@ def described(config: Config) -> dict[str, str]:
 
 
 def environment(config: Config) -> Any:
-    """The environment of a config, opened once a process. Raises SettingError, in one line, where it cannot be made."""
+    """The environment of a config, opened once a process. Raises ConfigError, in one line, where it cannot be made."""
     import gymnasium
 
     from pegasus_envs.gym_plant import make_env
@@ -247,20 +247,20 @@ def environment(config: Config) -> Any:
     try:
         return make_env(config.env or "", config.env_args)
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
-        raise SettingError(f"env={config.env}: {str(error).splitlines()[0]}") from error
+        raise ConfigError(f"env={config.env}: {str(error).splitlines()[0]}") from error
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # sys.exit is one
         given = "; env_args.NAME=VALUE gives arguments" if isinstance(error, TypeError) else ""
-        raise SettingError(f"env={config.env} cannot be made: {user_code.told(error)}{given}") from error
+        raise ConfigError(f"env={config.env} cannot be made: {user_code.told(error)}{given}") from error
     finally:
         interrupt.reclaim()
 
 
 def of_mjcf(config: Config) -> Task:
-    """The task that an MJCF file and a cost of its observations pose. Raises SettingError if they cannot."""
+    """The task that an MJCF file and a cost of its observations pose. Raises ConfigError if they cannot."""
     if None in (config.mjcf, config.cost, config.dt, config.horizon):
-        raise SettingError(
+        raise ConfigError(
             "task=mjcf needs mjcf=, cost=, dt= and horizon=; for example "
             "mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40"
         )
@@ -271,7 +271,7 @@ def of_mjcf(config: Config) -> Task:
     try:
         plant = mjcf_plant.mechanism(model, config.dt or 0.0, **{name: getattr(config, name) for name in names})
     except ValueError as error:
-        raise SettingError(f"mjcf={config.mjcf}: {error}") from error
+        raise ConfigError(f"mjcf={config.mjcf}: {error}") from error
     name = Path(config.mjcf or "").stem
     task = _of_users(config, name, plant, plant, config.horizon or 0, plant.state_names, plant.control_names)
     return task._replace(rates=plant.rates)
@@ -292,7 +292,7 @@ def _model(config: Config) -> Any:
     try:
         return mjcf_plant.read(Path(config.mjcf or ""))
     except ValueError as error:
-        raise SettingError(f"mjcf={config.mjcf}: {error}") from error
+        raise ConfigError(f"mjcf={config.mjcf}: {error}") from error
 
 
 def _of_users(
@@ -323,7 +323,7 @@ def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> 
     """The entries, if they are ones of the observation."""
     for entry in entries:
         if not 0 <= entry < states:
-            raise SettingError(
+            raise ConfigError(
                 f"{setting}={entry} is not an entry of {name}'s observation; choose from 0 to {states - 1}"
             )
     return entries

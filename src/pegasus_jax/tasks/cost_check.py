@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax.checks import SettingError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.tasks.user_code import blamed, definition, line_of, place_of
 
 UNBOUNDED = 1e6  # limits of an observation beyond this are none
@@ -28,7 +28,7 @@ class Facts(NamedTuple):
 
 
 def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
-    """What its owner should know of a cost. Raises SettingError, beginning with `what`, if it cannot be learned from.
+    """What its owner should know of a cost. Raises ConfigError, beginning with `what`, if it cannot be learned from.
 
     It is traced once, and evaluated with its gradient at the start, at zero and at 100 points around them.
     """
@@ -36,12 +36,12 @@ def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
     points, values, slopes = _evaluated(cost, facts, what)
     least, most = int(np.argmin(values)), int(np.argmax(values))
     if values[least] < -1e-5 * max(1, np.abs(values).max()):
-        raise SettingError(
+        raise ConfigError(
             f"{what} is {values[least]:.3g}, negative, at {_text(points[least])}{_at(cost)}; is it a reward? A cost is"
             " 0 at the goal and grows away from it, to 1"
         )
     if not slopes.any():
-        raise SettingError(
+        raise ConfigError(
             f"{what} has a gradient of 0 at each of {len(points)} points{_at(cost)}, so a search has nothing to follow;"
             " for example 1 - jnp.exp(-d**2 / 2), where d is the distance from the goal"
         )
@@ -54,7 +54,7 @@ def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
 
 
 def _evaluated(cost: Callable[[Any], Any], facts: Facts, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(points [P, D], cost [P], gradient [P, D]). Raises SettingError where one of a possible state is not finite."""
+    """(points [P, D], cost [P], gradient [P, D]). Raises ConfigError where one of a possible state is not finite."""
     points = probes(facts)
     both = jax.jit(jax.vmap(jax.value_and_grad(lambda x: jnp.asarray(cost(x), float))))
     with blamed(what, cost):
@@ -64,10 +64,10 @@ def _evaluated(cost: Callable[[Any], Any], facts: Facts, what: str) -> tuple[np.
         if i < len(points) - AROUND and not _continuous(cost, points[i], facts, values):
             possible[i] = False  # arctan2(0, 0) of a cosine and a sine
         elif not np.isfinite(values[i]):
-            raise SettingError(f"{what} is {values[i]:g} at {_text(points[i])}{_at(cost)}; expected a finite number")
+            raise ConfigError(f"{what} is {values[i]:g} at {_text(points[i])}{_at(cost)}; expected a finite number")
         else:
             slope = slopes[i][~np.isfinite(slopes[i])][0]
-            raise SettingError(
+            raise ConfigError(
                 f"{what} has a gradient that is {slope:g} at {_text(points[i])}{_at(cost)}; a root or a norm has none"
                 " at 0, jnp.sqrt(s + 1e-6) has"
             )
@@ -101,7 +101,7 @@ def scales(facts: Facts) -> np.ndarray:
 
 
 def _traced(cost: Callable[[Any], Any], size: int, what: str) -> None:
-    """Raises SettingError unless JAX can trace the cost to one number, and it reads no entry that is not there."""
+    """Raises ConfigError unless JAX can trace the cost to one number, and it reads no entry that is not there."""
 
     def one(x: Any) -> Any:
         value = cost(x)
@@ -111,21 +111,21 @@ def _traced(cost: Callable[[Any], Any], size: int, what: str) -> None:
     try:
         with blamed(what, cost):
             traced = jax.make_jaxpr(one)(jax.ShapeDtypeStruct((size,), jnp.zeros(()).dtype))
-    except SettingError as error:
+    except ConfigError as error:
         if isinstance(error.__cause__, jax.errors.JAXTypeError):
-            raise SettingError(
+            raise ConfigError(
                 f"{what} is not a JAX function: it makes a Python number or a NumPy array of x"
                 f"{_in(line_of(error.__cause__) or definition(cost))}; use jax.numpy, and jnp.where instead of if"
             ) from error
         raise
     for index, length, line in beyond(traced):
-        raise SettingError(
+        raise ConfigError(
             f"{what} reads entry {index} of {length}{_in(line)}, where JAX takes another; x has {size}, 0 to {size - 1}"
         )
 
 
 def _number(value: Any, cost: Callable[[Any], Any], what: str) -> None:
-    """Raises SettingError unless the value that a cost returned is one real number that can change gradually."""
+    """Raises ConfigError unless the value that a cost returned is one real number that can change gradually."""
     kind = None
     if value is None:
         kind = "nothing; its return is missing"
@@ -138,7 +138,7 @@ def _number(value: Any, cost: Callable[[Any], Any], what: str) -> None:
     elif not jnp.issubdtype(jnp.result_type(value), jnp.floating):
         kind = "a whole number or true or false, whose gradient is 0; expected a number that falls towards the goal"
     if kind:
-        raise SettingError(f"{what} returns {kind}{_at(cost)}")
+        raise ConfigError(f"{what} returns {kind}{_at(cost)}")
 
 
 def beyond(traced: Any, given: Sequence[Any] = ()) -> list[tuple[int, int, str | None]]:

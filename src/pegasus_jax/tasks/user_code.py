@@ -13,7 +13,7 @@ from traceback import extract_tb
 from types import ModuleType
 from typing import Any
 
-from pegasus_jax.checks import SettingError, nearest
+from pegasus_jax.checks import ConfigError, nearest
 
 STANDARD = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib"))
 INSTALLED = ("site-packages", "dist-packages")
@@ -25,46 +25,46 @@ LONGEST = 300  # characters of somebody else's message
 def load(setting: str, name: str, not_from: Path | None = None) -> Callable[..., Any]:
     """The function `module:function` that a setting names, also of a module in the working folder.
 
-    Raises SettingError, in one line with the user's file and line, where it cannot be had; with `not_from`, a run's
+    Raises ConfigError, in one line with the user's file and line, where it cannot be had; with `not_from`, a run's
     folder, also where the module lies in it: looking at a run must not run what came with it.
     """
     module, _, function = name.partition(":")
     what = f"{setting}={name}"
     if not (module and function):
-        raise SettingError(f"{what} cannot be imported: expected {setting}=module:function, as in {setting}=robot:cost")
+        raise ConfigError(f"{what} cannot be imported: expected {setting}=module:function, as in {setting}=robot:cost")
     found = importing(what, module, not_from)
     with blamed(what):
         value = getattr(found, function, None)
     if value is None:
         names = [n for n in vars(found) if not n.startswith("_")]
         hint = nearest(function, names).partition("choices:")[0].strip() or f"expected {setting}=module:function"
-        raise SettingError(f"{what} cannot be imported: {origin(module) or module} has no {function}; {hint}")
+        raise ConfigError(f"{what} cannot be imported: {origin(module) or module} has no {function}; {hint}")
     if not callable(value):
-        raise SettingError(f"{what} is not a function, but of type {type(value).__name__}: {origin(module)}")
+        raise ConfigError(f"{what} is not a function, but of type {type(value).__name__}: {origin(module)}")
     return value
 
 
 def importing(what: str, module: str, not_from: Path | None = None) -> ModuleType:
-    """The module of that name, imported. Raises SettingError that begins with `what`; see `load`."""
+    """The module of that name, imported. Raises ConfigError that begins with `what`; see `load`."""
     here = os.getcwd()
     if here not in sys.path and not (not_from and _within(Path(here), not_from)):
         sys.path.append(here)
     parts = module.split(".")
     if parts[0] not in sys.modules and importlib.util.find_spec(parts[0]) is None:
-        raise SettingError(
+        raise ConfigError(
             f"{what} cannot be imported: no module named '{parts[0]}' in {here} or among the installed packages"
         )
     for count in range(1, len(parts) + 1):  # from the outside in: to find a module imports those that hold it
         part = ".".join(parts[:count])
         place = origin(part, what)
         if not_from and any(_within(path, not_from) for path in _places(part, what)):
-            raise SettingError(
+            raise ConfigError(
                 f"{what} cannot be imported from {place or part}: it lies in the run's folder, whose code is not run;"
                 " start the command where your own is"
             )
         own = Path(here, f"{part}.py")
         if count == 1 and own.is_file() and place and own.resolve() != place.resolve():
-            raise SettingError(f"{what} cannot be imported: {part} is {place}, not your {own.name}; rename that file")
+            raise ConfigError(f"{what} cannot be imported: {part} is {place}, not your {own.name}; rename that file")
     with blamed(what, imports=True):
         return importlib.import_module(module)
 
@@ -83,7 +83,7 @@ def _places(module: str, what: str) -> list[Path]:
         with blamed(what or module, imports=True):
             spec = importlib.util.find_spec(module)
     except ValueError as error:
-        if isinstance(error, SettingError) and what:
+        if isinstance(error, ConfigError) and what:
             raise
         return []
     if spec is None:
@@ -103,11 +103,11 @@ def blamed(what: str, function: Any = None, imports: bool = False) -> Iterator[N
     """
     try:
         yield
-    except (KeyboardInterrupt, SettingError):
+    except (KeyboardInterrupt, ConfigError):
         raise
     except BaseException as error:
         middle = " cannot be imported" if imports and isinstance(error, ImportError) else ""
-        raise SettingError(f"{what}{middle}: {told(error, function)}") from error
+        raise ConfigError(f"{what}{middle}: {told(error, function)}") from error
 
 
 def told(error: BaseException, function: Any = None) -> str:

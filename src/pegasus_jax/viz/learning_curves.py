@@ -37,9 +37,9 @@ def picture(
 ) -> None:
     """Draw label -> (mean cost [S, T], success rate [S, T]) against plant time [s]."""
     figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(7, 6))
-    for colour, (label, (cost, success)) in enumerate(results.items()):
-        curves(top, seconds[: cost.shape[1]], cost, f"C{colour}", label)
-        curves(bottom, seconds[: cost.shape[1]], success, f"C{colour}", label)
+    for color, (label, (cost, success)) in enumerate(results.items()):
+        curves(top, seconds[: cost.shape[1]], cost, f"C{color}", label)
+        curves(bottom, seconds[: cost.shape[1]], success, f"C{color}", label)
     top.set(title=title, ylabel="mean cost a step")
     bottom.set(ylabel="success rate", xlabel="plant time [s]")
     top.legend(frameon=False)
@@ -48,12 +48,12 @@ def picture(
     plt.close(figure)
 
 
-def curves(axis: Axes, x: list[float], values: np.ndarray, colour: str, label: str) -> None:
+def curves(axis: Axes, x: list[float], values: np.ndarray, color: str, label: str) -> None:
     """Raw curves [S, T] thin; interquartile mean over seeds thick, with its 95 % bootstrap interval."""
-    axis.plot(x, values.T, color=colour, lw=0.5, alpha=0.4)
-    axis.plot(x, middle(values), color=colour, lw=2, label=label)
+    axis.plot(x, values.T, color=color, lw=0.5, alpha=0.4)
+    axis.plot(x, middle(values), color=color, lw=2, label=label)
     if values.shape[0] > 2:
-        axis.fill_between(x, *interval(values), color=colour, alpha=0.2, lw=0)
+        axis.fill_between(x, *interval(values), color=color, alpha=0.2, lw=0)
     axis.grid(alpha=0.25)
 
 

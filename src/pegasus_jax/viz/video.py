@@ -30,7 +30,7 @@ COMING = 0.15  # how much is seen of what is yet to come
 class Strip(NamedTuple):
     """Cost and command of one episode against time, as a picture."""
 
-    picture: np.ndarray  # [STRIP, WIDTH, 3] 8-bit colours
+    picture: np.ndarray  # [STRIP, WIDTH, 3] 8-bit colors
     left: int  # column of the episode's first moment [pixels]
     right: int  # column of its last
     top: int  # first row of the axes [pixels]
