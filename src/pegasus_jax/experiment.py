@@ -70,8 +70,8 @@ def experiment(
     """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned.
 
     `imagine(key, policy parameters, posterior)` rolls out fresh scenarios -> (rollout, cost [H, K]). With `compare` a
-    new policy takes the old one's place only where it is expected to cost less. With an environment instead of a plant in
-    JAX, `episode` and `collect` are not pure, and `drive` is there.
+    new policy takes the old one's place only where it is expected to cost less. With an environment instead of a plant
+    in JAX, `episode` and `collect` are not pure, and `drive` is there.
     """
     states, controls = len(task.state_names), len(task.control_names)
 
