@@ -19,7 +19,7 @@ from benchmarks.growth import experience
 from benchmarks.study import RESULTS
 from benchmarks.timing import compiled, in_turn, matmul
 from benchmarks.workloads import ALIKE
-from pegasus_jax.builder import build, set_precision
+from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.presets import MODELS, POLICIES
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about

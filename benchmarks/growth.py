@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from benchmarks.suite import RESULTS
 from benchmarks.timing import compiled, in_turn, matmul, summary
 from benchmarks.workloads import ALIKE
-from pegasus_jax.builder import build, set_precision
+from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.study import RESULTS
 from pegasus_jax import episode
-from pegasus_jax.builder import build, set_precision
+from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.math.angles import difference
 from pegasus_jax.models.calibration import one_step_errors, overconfidence

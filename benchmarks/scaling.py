@@ -31,7 +31,7 @@ from benchmarks.study import RESULTS
 from benchmarks.timing import summary
 from benchmarks.workloads import ALIKE, workload
 from pegasus_jax import sharding
-from pegasus_jax.builder import build, compose, set_precision
+from pegasus_jax.assembly.experiments import build, compose, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import EVALUATE, trial_key
 from pegasus_jax.runs import config_io

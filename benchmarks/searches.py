@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.study import RESULTS
-from pegasus_jax.builder import build, set_precision
+from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import trial
 from pegasus_jax.runs import config_io

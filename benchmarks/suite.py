@@ -22,7 +22,7 @@ import numpy as np
 
 from benchmarks.timing import clock, compiled, in_turn, matmul, own_products, summary
 from benchmarks.workloads import SIZES, Workload, flop, workload
-from pegasus_jax.builder import build
+from pegasus_jax.assembly.experiments import build
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about, processors

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import tasks
-from pegasus_jax.builder import blocks_of, compose
+from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.assembly.searchers import blocks_of
 from pegasus_jax.config import Config
 from pegasus_jax.imagine import costs, matching
 from pegasus_jax.imagine.objective import objective

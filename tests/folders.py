@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import tasks
-from pegasus_jax.builder import compose
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.runs import checkpoint, config_io, store
 from pegasus_jax.runs.restore import precision
 from pegasus_jax.types import Task, Trajectory

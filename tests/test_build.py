@@ -9,17 +9,9 @@ import numpy as np
 import pytest
 
 from pegasus_jax import config, tasks
-from pegasus_jax.builder import (
-    AGGREGATES,
-    EXPLORATIONS,
-    build,
-    compose,
-    dropout_of,
-    policy_of,
-    search_of,
-    set_precision,
-    start,
-)
+from pegasus_jax.assembly.experiments import EXPLORATIONS, build, compose, set_precision
+from pegasus_jax.assembly.pieces import dropout_of, policy_of
+from pegasus_jax.assembly.searchers import AGGREGATES, search_of, start
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config, Period
 from pegasus_jax.config_models import DROPOUTS

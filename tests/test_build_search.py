@@ -11,7 +11,9 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from pegasus_jax import config, types
-from pegasus_jax.builder import compose, costs_of, dynamics_of, fit_of, start
+from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.assembly.pieces import dynamics_of, fit_of
+from pegasus_jax.assembly.searchers import costs_of, start
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Period
 from pegasus_jax.experiment import SEARCH, trial_key
@@ -179,7 +181,7 @@ def test_what_is_weighed_needs_no_second_program(monkeypatch):
     """The objective is traced as often with a restart and turns as without: to compile it again would take as long."""
     traced = []
     counted = lambda *given, **pieces: traced.append(1) or objective(*given, **pieces)  # noqa: E731
-    monkeypatch.setattr(sys.modules["pegasus_jax.builder"], "objective", counted)
+    monkeypatch.setattr(sys.modules["pegasus_jax.assembly.searchers"], "objective", counted)
 
     def times(**search):
         traced.clear()

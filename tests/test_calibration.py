@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.builder import compose
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.models.calibration import calibration
 from pegasus_jax.types import Dynamics, Prediction, Trajectory
 from probes import PENDULUM, cart, experience, known, network, noisy_linear_policy, regression, same, tiny

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.builder import blocks_of, dynamics_of, policy_of
+from pegasus_jax.assembly.pieces import dynamics_of, policy_of
+from pegasus_jax.assembly.searchers import blocks_of
 from pegasus_jax.config import BNN, MLP
 from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.models.ensemble import ensemble

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.builder import compose, dynamics_of
+from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.assembly.pieces import dynamics_of
 from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
 from pegasus_jax.presets import ALGORITHMS, MODELS, POLICIES
 from pegasus_jax.runs import config_io

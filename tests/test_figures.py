@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks import results_page
 from benchmarks.study import RESULTS
-from pegasus_jax.builder import build
+from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import BNN, RBF, SSGP, Analytic, Config
 from pegasus_jax.studies import claims, comparison

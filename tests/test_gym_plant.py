@@ -15,7 +15,7 @@ import pytest
 
 from pegasus_envs.gym_plant import env_plant, env_spec, make_env, period
 from pegasus_jax import episode, interrupt
-from pegasus_jax.builder import compose
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.runs import config_io, store
 from pegasus_jax.types import Task
 from probes import cart, tiny

@@ -19,7 +19,7 @@ LAYERS = {
     2: "config models. imagine. episode",
     3: "presets policies. learn.",
     4: "tasks. pilco. experiment",
-    5: "builder",
+    5: "assembly.",
     6: "runs.",
     7: "viz.",
     8: "studies.",
@@ -140,7 +140,7 @@ def test_environments_know_nothing_of_the_library() -> None:
 # The checker itself, on a small package with something planted in it.
 
 CLEAN = {
-    "__init__.py": "from pegasus_jax.builder import build\nfrom pegasus_jax.imagine.rollout import rollout\n",
+    "__init__.py": "from pegasus_jax.assembly.experiments import build\nfrom pegasus_jax.imagine import rollout\n",
     "types.py": "import jax\n",
     "math/__init__.py": "",
     "math/angles.py": "from pegasus_jax.types import A\n",
@@ -152,7 +152,7 @@ CLEAN = {
     "models/__init__.py": "from .bnn import bnn\n",
     "models/bnn.py": "from ..math.angles import wrap\n",
     "tasks/__init__.py": "import pegasus_envs\n",
-    "builder.py": "from pegasus_jax.models import bnn\nfrom pegasus_jax import tasks\n",
+    "assembly/experiments.py": "from pegasus_jax.models import bnn\nfrom pegasus_jax import tasks\n",
     "runs/__init__.py": "",
     "runs/store.py": "def load():\n    from omegaconf import OmegaConf\n",
     "viz/__init__.py": "",
@@ -194,8 +194,12 @@ ROLLOUT = "imagine.rollout (layer 2) imports"
         ("models/bnn.py", "from ..tasks import cartpole\n", "models.bnn (layer 2) imports tasks.__init__ (layer 4)"),
         ("imagine/costs.py", "from .rollout import f\n", "cycle: imagine.costs -> imagine.rollout -> imagine.costs"),
         ("runs/store.py", "from pegasus_jax.viz import curve\n", "import cycle: runs.store -> viz.curve -> runs.store"),
-        ("builder.py", "from pegasus_envs import cartpole\n", "only tasks. may import pegasus_envs"),
-        ("builder.py", "from omegaconf import OmegaConf\n", "builder (layer 5) imports omegaconf"),
+        ("assembly/experiments.py", "from pegasus_envs import cartpole\n", "only tasks. may import pegasus_envs"),
+        (
+            "assembly/experiments.py",
+            "from omegaconf import OmegaConf\n",
+            "assembly.experiments (layer 5) imports omegaconf",
+        ),
         ("types.py", "import rich.progress\n", "types (layer 0) imports rich"),
         ("helpers.py", "", "helpers.py: unknown: give helpers a layer in test_layers.py"),
         ("utils/misc.py", "", "utils/misc.py: unknown: give utils. a layer in test_layers.py"),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from jax.sharding import AbstractDevice, AbstractMesh, use_abstract_mesh
 
-from pegasus_jax.builder import build
+from pegasus_jax.assembly.experiments import build
 from pegasus_jax.imagine import _matching_pallas as kernel
 from pegasus_jax.imagine import matching
 from pegasus_jax.runs import config_io

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pegasus_envs import mjcf_plant
-from pegasus_jax.builder import build
+from pegasus_jax.assembly.experiments import build
 from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import make
 from pegasus_jax.types import Trajectory

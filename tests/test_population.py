@@ -10,7 +10,7 @@ import optax
 import pytest
 
 from pegasus_jax import config
-from pegasus_jax.builder import compose
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.learn.multistart import best_of
 from pegasus_jax.learn.search import SearchInfo

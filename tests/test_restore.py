@@ -11,7 +11,7 @@ import pytest
 
 from folders import a_run
 from pegasus_jax import tasks
-from pegasus_jax.builder import build
+from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.runs import checkpoint, config_io, restore, store
 from test_train import call

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.builder import compose
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.runs import machine, programs, store
 from pegasus_jax.runs.programs import Program, over_seeds
 from probes import EMITTERS, cart, tiny, unchecked

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax.builder import compose
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import BNN, KINDS, RBF, Analytic, Config, Lagrangian, Period, Search
 from pegasus_jax.runs import config_io

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from pegasus_jax import tasks
-from pegasus_jax.builder import build
+from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io, store

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.builder import compose
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.config import Period
 from pegasus_jax.experiment import COLLECT, EVALUATE, FIT, IMAGINE, RESTART, SEARCH, TrialInfo, run, trial_key
 from pegasus_jax.types import Policy, Prediction

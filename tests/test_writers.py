@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.builder import compose
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import RunError
 from pegasus_jax.experiment import run
 from pegasus_jax.runs import checkpoint, store, writers

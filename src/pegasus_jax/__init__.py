@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pegasus_jax import config, tasks
-    from pegasus_jax.builder import build, compose, dynamics_of, policy_of
+    from pegasus_jax.assembly.experiments import build, compose
+    from pegasus_jax.assembly.pieces import dynamics_of, policy_of
     from pegasus_jax.checks import ConfigError, RunError
     from pegasus_jax.config import Config
     from pegasus_jax.experiment import TrialInfo, run, trial
@@ -70,7 +71,8 @@ _NAMES = {
     # a run, from settings
     "config": "Config",
     "presets": "preset",
-    "builder": "build compose dynamics_of policy_of",
+    "assembly.experiments": "build compose",
+    "assembly.pieces": "dynamics_of policy_of",
     "experiment": "run trial TrialInfo",
     "checks": "ConfigError RunError",
     "runs.controller": "controller Controller",

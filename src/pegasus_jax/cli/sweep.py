@@ -106,7 +106,7 @@ def jobs_of(words: dict[str, str], out: Path) -> list[Job]:
 def check(job: Job) -> None:
     """Raise ConfigError for settings that cannot be, or a folder that holds runs already."""
     from pegasus_jax import tasks
-    from pegasus_jax.builder import build, set_precision
+    from pegasus_jax.assembly.experiments import build, set_precision
     from pegasus_jax.runs import config_io, store
 
     _, words = config_io.split(job.words, ("out", *OF_TRAIN))

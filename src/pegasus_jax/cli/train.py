@@ -133,7 +133,7 @@ def _configured(asked: Asked) -> Any:
 
 def _checked(asked: Asked, over: Any) -> Config:
     """The config with all that is known of its task. Impossible settings end here, before anything is written."""
-    from pegasus_jax.builder import build
+    from pegasus_jax.assembly.experiments import build
     from pegasus_jax.runs import restore
     from pegasus_jax.runs.check import RESETS, before_training
     from pegasus_jax.tasks import pinned

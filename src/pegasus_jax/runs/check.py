@@ -109,7 +109,7 @@ def report(config: Config) -> list[str]:
 
     Raises ConfigError, in one line, for what cannot be learned.
     """
-    from pegasus_jax.builder import build, set_precision
+    from pegasus_jax.assembly.experiments import build, set_precision
 
     given = bool(config.start_mean)
     set_precision(config)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from pegasus_jax import tasks
-from pegasus_jax.builder import build, set_precision
+from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.learn.data import grow
 from pegasus_jax.runs import restore, writers

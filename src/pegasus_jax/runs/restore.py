@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import tasks
-from pegasus_jax.builder import compose, set_precision
+from pegasus_jax.assembly.experiments import compose, set_precision
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
 from pegasus_jax.episode import verdict

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from pegasus_jax.builder import build
+from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError, RunError, nearest
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io

@@ -1,49 +1,30 @@
-"""Config -> Experiment. The only place that matches on the kind of a setting."""
+"""How a search's settings become a searcher, and fresh imagined rollouts of the same kind."""
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import optax
-from jax.sharding import Mesh
 
 from pegasus_jax import config as settings
-from pegasus_jax import episode, tasks
+from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.experiment import experiment
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching, scenarios
 from pegasus_jax.imagine.costs import of_particles
 from pegasus_jax.imagine.objective import either, objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
-from pegasus_jax.learn.fit import falling, minibatches
 from pegasus_jax.learn.multistart import best_of
 from pegasus_jax.learn.schedule import SearchTable, search_table
 from pegasus_jax.learn.search import Problem, sampler, searcher
-from pegasus_jax.math import angles, gaussian
-from pegasus_jax.models import dropout
-from pegasus_jax.models.bnn import bnn
-from pegasus_jax.models.ensemble import ensemble
-from pegasus_jax.models.lagrangian import lagrangian
 from pegasus_jax.pilco import search as pilco
-from pegasus_jax.pilco.gp import gp
-from pegasus_jax.pilco.lbfgs import full_data
-from pegasus_jax.pilco.rbf import rbf
-from pegasus_jax.pilco.ssgp import ssgp
-from pegasus_jax.policies.linear import linear
-from pegasus_jax.policies.mlp import mlp
 from pegasus_jax.policies.scaled import inherited
-from pegasus_jax.policies.squash import SQUASHES, to_limits
-from pegasus_jax.sharding import Spread, over_particles, together
+from pegasus_jax.sharding import Spread, together
 from pegasus_jax.types import (
     Array,
-    Cost,
-    Dropout,
     Dynamics,
-    Experiment,
-    Fitter,
     Key,
     Params,
     Period,
@@ -54,96 +35,11 @@ from pegasus_jax.types import (
     Task,
 )
 
-AGGREGATES = {"mean": cost.mean, "total": cost.total}
-NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
-    "log_normal": lambda config: dropout.log_normal(config.low),
-    "binary": lambda _: dropout.binary(),
-    "concrete": lambda _: dropout.concrete(),
-    "gaussian": lambda _: dropout.gaussian(),
-    "sparse": lambda _: dropout.sparse(),
-    "none": lambda _: dropout.none(),
-}
-EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
-
-
-@lru_cache(maxsize=64)
-def build(config: settings.Config, mesh: Mesh | None = None) -> Experiment:
-    """The experiment of a config. Cached: the same config gives the same functions, which compile once."""
-    return compose(config, tasks.of_config(config), mesh=mesh)
-
-
-def compose(
-    config: settings.Config,
-    task: Task,
-    *,
-    dynamics: Dynamics | None = None,
-    policy: Policy | None = None,
-    fitter: Fitter | None = None,
-    searcher: Searcher | None = None,
-    cost: Cost | None = None,
-    mesh: Mesh | None = None,
-) -> Experiment:
-    """The experiment of a config on any task, with pieces of your own in place of the configured or the task's ones.
-
-    A `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
-    With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
-    does not suit the config: a cost without a width, for example, needs `search.widen=1`.
-    """
-    task = task if cost is None else with_cost(task, cost)
-    dynamics = dynamics or dynamics_of(config.model, task)
-    policy = policy or policy_of(config.policy, task)
-    configured, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
-    low, high = limits(task)
-    explore = config.explore
-    return experiment(
-        task=task,
-        dynamics=dynamics,
-        policy=policy,
-        fit=fitter or fit_of(config.fit, dynamics),
-        fit_steps=config.fit.steps,
-        search=searcher or configured,
-        search_steps=config.search.steps,
-        imagine=imagine,
-        explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
-        explore_trials=explore.trials,
-        compare=config.successor == "better",
-        capacity=config.trials * task.horizon,
-    )
-
-
-def with_cost(task: Task, cost: Cost) -> Task:
-    """The task with another cost. Raises ConfigError for a bare function."""
-    if not isinstance(cost, Cost):
-        raise ConfigError(f"cost={cost!r} is no Cost; a function of one state x [D] makes one: Cost(function)")
-    return task._replace(cost=cost.of_state, expected_cost=cost.expected, widened=cost.widen)
-
-
-def set_precision(config: settings.Config) -> None:
-    """Make the configured precision JAX's own, for everything in this process from now on.
-
-    That of products too, unless JAX was told: a GPU's usual 10 bits are too few for gradients of a whole rollout.
-    """
-    jax.config.update("jax_enable_x64", config.precision == "double")
-    if jax.default_backend() == "gpu" and jax.config.jax_default_matmul_precision is None:  # pyright: ignore[reportAttributeAccessIssue]
-        jax.config.update("jax_default_matmul_precision", "float32")
-
-
-def limits(task: Task) -> tuple[Array, Array]:
-    """The lowest and the highest control [U]."""
-    return jnp.asarray(task.control_low, float), jnp.asarray(task.control_high, float)
-
-
-def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
-    """The configured way of fitting a model."""
-    if isinstance(config, settings.LBFGS):
-        return full_data(dynamics, starts=config.starts)
-    rate = falling(config.learning_rate, config.decay, config.steps)
-    return minibatches(dynamics, optax.adam(rate), batch=config.batch)
-
-
 Imagine = Callable[
     [Key, Params, Params], tuple[Rollout, Array]
 ]  # (key, policy parameters, posterior) -> cost [H, K] too
+
+AGGREGATES = {"mean": cost.mean, "total": cost.total}
 
 
 def search_of(
@@ -338,77 +234,6 @@ def start(key: Key, *, task: Task) -> Array:
     return mean + std * jax.random.normal(key, mean.shape)
 
 
-def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
-    """The configured model of a task's dynamics. Raises ConfigError where the task does not suit it."""
-    shape: dict[str, Any] = dict(states=len(task.state_names), controls=len(task.control_names), angles=task.angles)
-    match config:
-        case settings.GP():
-            return gp(**shape)
-        case settings.SSGP():
-            return ssgp(**shape)
-        case settings.Lagrangian():
-            rates = tasks.rates_of(task)
-            member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
-        case settings.BNN():
-            member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic)
-    return ensemble(member, config.members) if config.members > 1 else member
-
-
-def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
-    """What describes the network of a model."""
-    return dict(
-        hidden=config.hidden,
-        dropout=dropout_of(config),
-        kl_weight=config.kl_weight,
-        weight_decay=config.weight_decay,
-        activation=config.activation,
-        initialiser=config.initialiser,
-    )
-
-
-def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
-    """The configured noise on a model's units. Raises ConfigError for parameters it cannot have."""
-    try:
-        return NOISES[config.dropout](config)
-    except ValueError as error:
-        raise ConfigError(f"model.dropout={config.dropout}: {error}") from error
-
-
-def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task) -> Policy:
-    """The configured controller of a task."""
-    low, high = limits(task)
-    encode = partial(angles.encode, angles=task.angles)
-    features, controls = len(task.state_names) + len(task.angles), len(task.control_names)
-    saturate = to_limits(SQUASHES[config.squash], low, high)
-    # Of the saturations, only the sine has moments in closed form.
-    saturate_moments = partial(gaussian.squash, low=low, high=high) if config.squash == "sine" else None
-    match config:
-        case settings.RBF():
-            return rbf(
-                encode=encode,
-                start=partial(start, task=task),
-                waves=2 * len(task.angles),
-                controls=controls,
-                units=config.units,
-                saturate=saturate,
-                saturate_moments=saturate_moments,
-            )
-        case settings.Linear():
-            return linear(
-                encode=encode,
-                features=features,
-                controls=controls,
-                saturate=saturate,
-                saturate_moments=saturate_moments,
-            )
-        case settings.MLP():
-            return mlp(
-                encode=encode,
-                features=features,
-                controls=controls,
-                hidden=config.hidden,
-                dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
-                saturate=saturate,
-                initialiser=config.initialiser,
-                input_scale=tasks.input_scale(task, config.input_units),
-            )
+def limits(task: Task) -> tuple[Array, Array]:
+    """The lowest and the highest control [U]."""
+    return jnp.asarray(task.control_low, float), jnp.asarray(task.control_high, float)

@@ -1,0 +1,87 @@
+"""Config -> Experiment: the pieces that the settings name, or your own, composed."""
+
+from functools import lru_cache, partial
+
+import jax
+from jax.sharding import Mesh
+
+from pegasus_jax import config as settings
+from pegasus_jax import episode, tasks
+from pegasus_jax.assembly.pieces import dynamics_of, fit_of, policy_of
+from pegasus_jax.assembly.searchers import limits, search_of
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.experiment import experiment
+from pegasus_jax.sharding import over_particles
+from pegasus_jax.types import (
+    Cost,
+    Dynamics,
+    Experiment,
+    Fitter,
+    Policy,
+    Searcher,
+    Task,
+)
+
+EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
+
+
+@lru_cache(maxsize=64)
+def build(config: settings.Config, mesh: Mesh | None = None) -> Experiment:
+    """The experiment of a config. Cached: the same config gives the same functions, which compile once."""
+    return compose(config, tasks.of_config(config), mesh=mesh)
+
+
+def compose(
+    config: settings.Config,
+    task: Task,
+    *,
+    dynamics: Dynamics | None = None,
+    policy: Policy | None = None,
+    fitter: Fitter | None = None,
+    searcher: Searcher | None = None,
+    cost: Cost | None = None,
+    mesh: Mesh | None = None,
+) -> Experiment:
+    """The experiment of a config on any task, with pieces of your own in place of the configured or the task's ones.
+
+    A `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
+    With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
+    does not suit the config: a cost without a width, for example, needs `search.widen=1`.
+    """
+    task = task if cost is None else with_cost(task, cost)
+    dynamics = dynamics or dynamics_of(config.model, task)
+    policy = policy or policy_of(config.policy, task)
+    configured, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
+    low, high = limits(task)
+    explore = config.explore
+    return experiment(
+        task=task,
+        dynamics=dynamics,
+        policy=policy,
+        fit=fitter or fit_of(config.fit, dynamics),
+        fit_steps=config.fit.steps,
+        search=searcher or configured,
+        search_steps=config.search.steps,
+        imagine=imagine,
+        explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
+        explore_trials=explore.trials,
+        compare=config.successor == "better",
+        capacity=config.trials * task.horizon,
+    )
+
+
+def with_cost(task: Task, cost: Cost) -> Task:
+    """The task with another cost. Raises ConfigError for a bare function."""
+    if not isinstance(cost, Cost):
+        raise ConfigError(f"cost={cost!r} is no Cost; a function of one state x [D] makes one: Cost(function)")
+    return task._replace(cost=cost.of_state, expected_cost=cost.expected, widened=cost.widen)
+
+
+def set_precision(config: settings.Config) -> None:
+    """Make the configured precision JAX's own, for everything in this process from now on.
+
+    That of products too, unless JAX was told: a GPU's usual 10 bits are too few for gradients of a whole rollout.
+    """
+    jax.config.update("jax_enable_x64", config.precision == "double")
+    if jax.default_backend() == "gpu" and jax.config.jax_default_matmul_precision is None:  # pyright: ignore[reportAttributeAccessIssue]
+        jax.config.update("jax_default_matmul_precision", "float32")

@@ -1,0 +1,125 @@
+"""How the settings of a model, a policy and a fit become those pieces."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import optax
+
+from pegasus_jax import config as settings
+from pegasus_jax import tasks
+from pegasus_jax.assembly.searchers import limits, start
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.learn.fit import falling, minibatches
+from pegasus_jax.math import angles, gaussian
+from pegasus_jax.models import dropout
+from pegasus_jax.models.bnn import bnn
+from pegasus_jax.models.ensemble import ensemble
+from pegasus_jax.models.lagrangian import lagrangian
+from pegasus_jax.pilco.gp import gp
+from pegasus_jax.pilco.lbfgs import full_data
+from pegasus_jax.pilco.rbf import rbf
+from pegasus_jax.pilco.ssgp import ssgp
+from pegasus_jax.policies.linear import linear
+from pegasus_jax.policies.mlp import mlp
+from pegasus_jax.policies.squash import SQUASHES, to_limits
+from pegasus_jax.types import (
+    Dropout,
+    Dynamics,
+    Fitter,
+    Policy,
+    Task,
+)
+
+NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
+    "log_normal": lambda config: dropout.log_normal(config.low),
+    "binary": lambda _: dropout.binary(),
+    "concrete": lambda _: dropout.concrete(),
+    "gaussian": lambda _: dropout.gaussian(),
+    "sparse": lambda _: dropout.sparse(),
+    "none": lambda _: dropout.none(),
+}
+
+
+def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
+    """The configured way of fitting a model."""
+    if isinstance(config, settings.LBFGS):
+        return full_data(dynamics, starts=config.starts)
+    rate = falling(config.learning_rate, config.decay, config.steps)
+    return minibatches(dynamics, optax.adam(rate), batch=config.batch)
+
+
+def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
+    """The configured model of a task's dynamics. Raises ConfigError where the task does not suit it."""
+    shape: dict[str, Any] = dict(states=len(task.state_names), controls=len(task.control_names), angles=task.angles)
+    match config:
+        case settings.GP():
+            return gp(**shape)
+        case settings.SSGP():
+            return ssgp(**shape)
+        case settings.Lagrangian():
+            rates = tasks.rates_of(task)
+            member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
+        case settings.BNN():
+            member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic)
+    return ensemble(member, config.members) if config.members > 1 else member
+
+
+def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
+    """What describes the network of a model."""
+    return dict(
+        hidden=config.hidden,
+        dropout=dropout_of(config),
+        kl_weight=config.kl_weight,
+        weight_decay=config.weight_decay,
+        activation=config.activation,
+        initialiser=config.initialiser,
+    )
+
+
+def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
+    """The configured noise on a model's units. Raises ConfigError for parameters it cannot have."""
+    try:
+        return NOISES[config.dropout](config)
+    except ValueError as error:
+        raise ConfigError(f"model.dropout={config.dropout}: {error}") from error
+
+
+def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task) -> Policy:
+    """The configured controller of a task."""
+    low, high = limits(task)
+    encode = partial(angles.encode, angles=task.angles)
+    features, controls = len(task.state_names) + len(task.angles), len(task.control_names)
+    saturate = to_limits(SQUASHES[config.squash], low, high)
+    # Of the saturations, only the sine has moments in closed form.
+    saturate_moments = partial(gaussian.squash, low=low, high=high) if config.squash == "sine" else None
+    match config:
+        case settings.RBF():
+            return rbf(
+                encode=encode,
+                start=partial(start, task=task),
+                waves=2 * len(task.angles),
+                controls=controls,
+                units=config.units,
+                saturate=saturate,
+                saturate_moments=saturate_moments,
+            )
+        case settings.Linear():
+            return linear(
+                encode=encode,
+                features=features,
+                controls=controls,
+                saturate=saturate,
+                saturate_moments=saturate_moments,
+            )
+        case settings.MLP():
+            return mlp(
+                encode=encode,
+                features=features,
+                controls=controls,
+                hidden=config.hidden,
+                dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
+                saturate=saturate,
+                initialiser=config.initialiser,
+                input_scale=tasks.input_scale(task, config.input_units),
+            )
