@@ -90,5 +90,5 @@ def test_what_is_no_run_says_so(tmp_path: Path) -> None:
         pegasus_jax.controller(tmp_path)
     run = a_run(tmp_path / "run", trials=1)
     shutil.rmtree(run / "checkpoints")
-    with pytest.raises(RunError, match="has no checkpoint"):
+    with pytest.raises(RunError, match="holds no checkpoint"):
         pegasus_jax.controller(run, trial="last")

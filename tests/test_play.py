@@ -63,7 +63,7 @@ def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
     experiment = build(config_io.parse(words))
     params = experiment.init(jax.random.key(0)).policy.params
     task = experiment.task._replace(horizon=2, cost=lambda x: x[0])
-    perform = jax.jit(partial(performance, task=task, policy=experiment.policy, mean=True))
+    perform = jax.jit(partial(performance, task=task, policy=experiment.policy))
     _, states = perform(jax.random.key(1), params)
     drawn = np.array(pictures(task, states, 64, 48), int)
     assert drawn.shape[1:] == (48, 64, 3)

@@ -179,7 +179,7 @@ def test_a_run_of_an_older_version_says_which(run: Path) -> None:
     told = json.loads((run / "run.json").read_text())
     del told["task"]
     (run / "run.json").write_text(json.dumps(told | {"versions": {"pegasus-jax": "0.0.7"}}))
-    assert "was made by pegasus-jax 0.0.7" in refused(store.load_episode, run, 1)
+    assert "of pegasus-jax 0.0.7" in refused(store.load_episode, run, 1)
 
 
 @pytest.mark.parametrize("name", [*store.FILES, *store.FOLDERS])

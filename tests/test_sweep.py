@@ -16,7 +16,7 @@ from pegasus_jax.cli.sweep import check, handle, jobs_of, values
 from pegasus_jax.runs import config_io, store
 from test_train import TINY
 
-PROGRAM = [sys.executable, "-c", "from pegasus_jax.sweep import sweep; sweep()"]
+PROGRAM = [sys.executable, "-c", "from pegasus_jax.cli.sweep import sweep; sweep()"]
 
 
 def call(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:

@@ -44,7 +44,7 @@ OPTIONS = ("launcher", "jobs", "out", "seeds", "mesh")
 OF_TRAIN = ("seeds", "mesh")  # of those, pegasus-train's
 MOST = 10_000  # runs of a sweep: beyond is a slip of the keyboard
 YEAR = 365 * 24 * 60  # [min]
-PROGRAM = [sys.executable, "-c", "from pegasus_jax.cli import train; train()"]  # pegasus-train, wherever that is
+PROGRAM = [sys.executable, "-c", "from pegasus_jax.cli.main import train; train()"]  # pegasus-train, wherever that is
 
 
 class Job(NamedTuple):

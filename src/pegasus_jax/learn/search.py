@@ -102,7 +102,7 @@ def searcher(problem: Problem) -> Searcher:
     """The searcher of a problem: its `run` is `search`, its learner's optimizer a `SearchState`."""
 
     def init(params: Params) -> SearchState:
-        return SearchState(problem.optimizer.init(params), params, jnp.asarray(jnp.nan, float), jnp.zeros((), bool))
+        return SearchState(problem.optimizer.init(params), params, jnp.asarray(jnp.inf, float), jnp.zeros((), bool))
 
     return Searcher(init, partial(search, problem=problem))
 
@@ -127,7 +127,7 @@ def search(
     table, draw, redraw = problem.table, problem.sampler.draw, problem.sampler.redraw
     check(table, steps, fresh)
     rows, begin = of_search(table, earlier), first_rows(table)
-    following = jnp.append(rows.scenarios[1:], 0)
+    following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
 
     def visit(r: Array, loop: Loop) -> Loop:
         (params, state), info = loop.learner, loop.info
