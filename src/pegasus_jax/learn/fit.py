@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import optax
 
 from pegasus_jax.learn.data import minibatch
+from pegasus_jax.learn.updates import is_finite, update_if
 from pegasus_jax.shapes import check_data
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Fitter, Key, Learner, Params
 
@@ -18,16 +19,6 @@ class FitInfo(NamedTuple):
     loss: Array  # [] mean over the last tenth of the steps [nats a row]
     first: Array  # [] the same over the first tenth
     skipped: Array  # [] updates skipped because a gradient was not finite
-
-
-def guarded(optimizer: optax.GradientTransformation) -> optax.GradientTransformation:
-    """The optimizer, except that a gradient with a non-finite entry changes nothing and is counted."""
-    return optax.apply_if_finite(optimizer, max_consecutive_errors=2**31 - 1)
-
-
-def skipped(state: optax.OptState) -> Array:
-    """Updates a `guarded` optimizer has skipped so far."""
-    return state.total_notfinite  # type: ignore[union-attr]
 
 
 def fit(
@@ -49,9 +40,8 @@ def fit(
     """
     check_data(data)
     context = prepare(data)
-    guard = optax.with_extra_args_support(guarded(optimizer))
 
-    def step(learner: Learner, key: Key) -> tuple[Learner, Array]:
+    def step(learner: Learner, key: Key) -> tuple[Learner, tuple[Array, Array]]:
         row_key, noise_key = jax.random.split(key)
         rows = minibatch(row_key, data, batch)
 
@@ -59,15 +49,14 @@ def fit(
             return loss(params, noise_key, rows, context)
 
         value, gradient = jax.value_and_grad(of_rows)(learner.params)
+        finite = is_finite(gradient)
         more = dict(value=value, grad=gradient, value_fn=of_rows)
-        updates, state = guard.update(gradient, learner.optimizer, learner.params, **more)
-        return Learner(optax.apply_updates(learner.params, updates), state), value
+        updates, state = update_if(finite, optimizer, gradient, learner, **more)
+        return Learner(optax.apply_updates(learner.params, updates), state), (value, finite)
 
-    begun = guard.init(learner.params)._replace(inner_state=learner.optimizer)  # type: ignore[union-attr]
-    (params, ended), losses = jax.lax.scan(step, Learner(learner.params, begun), jax.random.split(key, steps))
+    learner, (losses, finite) = jax.lax.scan(step, learner, jax.random.split(key, steps))
     tenth = max(steps // 10, 1)
-    info = FitInfo(jnp.mean(losses[-tenth:]), jnp.mean(losses[:tenth]), skipped(ended))
-    return Learner(params, ended.inner_state), info
+    return learner, FitInfo(jnp.mean(losses[-tenth:]), jnp.mean(losses[:tenth]), jnp.sum(~finite))
 
 
 def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:

@@ -10,6 +10,7 @@ import optax
 
 from pegasus_jax.imagine import scenarios as drawing
 from pegasus_jax.learn.schedule import FRESH, START, STEP, SearchTable, first_rows
+from pegasus_jax.learn.updates import is_finite, update_if
 from pegasus_jax.types import Array, Key, Learner, Params, Period, Scenarios, Searcher
 
 
@@ -70,32 +71,15 @@ def gradient_search(
     def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], SearchInfo]:
         learner, scenarios = carry
         value, gradient = jax.value_and_grad(objective)(learner.params, posterior, scenarios)
-        updates, state = update_if(is_finite(gradient), optimizer, gradient, learner, value)
+        finite = is_finite(gradient)
+        updates, state = update_if(finite, optimizer, gradient, learner, value=value)
         learner = Learner(optax.apply_updates(learner.params, updates), state)
-        info = SearchInfo(value, optax.tree.norm(gradient), ~is_finite(gradient))
+        info = SearchInfo(value, optax.tree.norm(gradient), ~finite)
         return (learner, sampler.redraw(key, i + 1, scenarios, posterior)), info
 
     begun = learner, sampler.draw(key, jnp.int32(0), posterior)
     (learner, _), info = jax.lax.scan(step, begun, jnp.arange(steps))
     return learner, info._replace(skipped=jnp.sum(info.skipped))
-
-
-def is_finite(gradient: Params) -> Array:
-    """[] whether every entry is."""
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)]))
-
-
-def update_if(
-    condition: Array, optimizer: optax.GradientTransformation, gradient: Params, learner: Learner, value: Array
-) -> tuple[Params, optax.OptState]:
-    """The optimizer's updates and its next state; where the condition does not hold zeros, and its state as it is."""
-    update = partial(optax.with_extra_args_support(optimizer).update, value=value)
-    zeros = jax.tree.map(jnp.zeros_like, gradient)
-    return jax.lax.cond(
-        condition,
-        lambda: update(gradient, learner.optimizer, learner.params),
-        lambda: (zeros, learner.optimizer),
-    )
 
 
 def searcher(problem: Problem) -> Searcher:
@@ -203,7 +187,7 @@ def after(
     steps_now = row.action == STEP
     taken |= steps_now
     params = optax.tree.where(taken, visited, params)
-    updates, moved = update_if(steps_now & finite, optimizer, gradient, Learner(params, state.optimizer), value)
+    updates, moved = update_if(steps_now & finite, optimizer, gradient, Learner(params, state.optimizer), value=value)
     start = optax.tree.where(row.candidate >= START, params, state.start)
     state = SearchState(moved, start, value, jnp.where(row.candidate == START, taken, state.no_improvement))
     params = optax.apply_updates(params, optax.tree.scale(row.step_size, updates))
@@ -213,7 +197,7 @@ def after(
 def packed(scenarios: Params) -> Params:
     """As one iteration hands them to the next: noise [H, K, D] as [H, K D].
 
-    A processor's compiler draws an array in the shape it is kept in, and rows of six dimensions take it five times as
+    A CPU's compiler draws an array in the shape it is kept in, and rows of six dimensions take it five times as
     long as rows of hundreds.
     """
     return jax.tree.map(lambda leaf: leaf.reshape(len(leaf), -1) if leaf.ndim > 2 else leaf, scenarios)

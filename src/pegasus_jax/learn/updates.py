@@ -1,0 +1,30 @@
+"""Updates that a gradient with a non-finite entry does not make: what a fit and a search share."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from pegasus_jax.types import Array, Learner, Params
+
+
+def is_finite(gradient: Params) -> Array:
+    """[] whether every entry is."""
+    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)]))
+
+
+def update_if(
+    condition: Array, optimizer: optax.GradientTransformation, gradient: Params, learner: Learner, **more: Any
+) -> tuple[Params, optax.OptState]:
+    """The optimizer's updates and its next state; where the condition does not hold zeros, and its state as it is.
+
+    `more` is for optimizers that ask for it, such as the `value` of the objective; others ignore it.
+    """
+    update = optax.with_extra_args_support(optimizer).update
+    zeros = jax.tree.map(jnp.zeros_like, gradient)
+    return jax.lax.cond(
+        condition,
+        lambda: update(gradient, learner.optimizer, learner.params, **more),
+        lambda: (zeros, learner.optimizer),
+    )
