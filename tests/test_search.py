@@ -288,7 +288,7 @@ def test_a_fresh_policy_that_a_table_needs_and_iterations_that_it_lacks_are_erro
 
 
 def test_one_program_serves_the_first_search_and_all_others():
-    """The state has the types at its beginning that it has after a search: else each would compile anew."""
+    """The state has the types at its beginning that it has after a search: else each would compile again."""
     found, learner = on_table(search_table(2, refine=1), optax.adam(0.1), value=rowless)
     run = jax.jit(partial(found.run, steps=2))
     for _ in range(2):

@@ -12,15 +12,7 @@ from pegasus_jax.assembly.searchers import limits, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import experiment
 from pegasus_jax.sharding import over_particles
-from pegasus_jax.types import (
-    Cost,
-    Dynamics,
-    Experiment,
-    Fitter,
-    Policy,
-    Searcher,
-    Task,
-)
+from pegasus_jax.types import Cost, Dynamics, Experiment, Fitter, Policy, Searcher, Task
 
 EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 

@@ -23,13 +23,7 @@ from pegasus_jax.pilco.ssgp import ssgp
 from pegasus_jax.policies.linear import linear
 from pegasus_jax.policies.mlp import mlp
 from pegasus_jax.policies.squash import SQUASHES, to_limits
-from pegasus_jax.types import (
-    Dropout,
-    Dynamics,
-    Fitter,
-    Policy,
-    Task,
-)
+from pegasus_jax.types import Dropout, Dynamics, Fitter, Policy, Task
 
 NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
     "log_normal": lambda config: dropout.log_normal(config.low),
@@ -88,38 +82,28 @@ def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
 def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task) -> Policy:
     """The configured controller of a task."""
     low, high = limits(task)
-    encode = partial(angles.encode, angles=task.angles)
-    features, controls = len(task.state_names) + len(task.angles), len(task.control_names)
-    saturate = to_limits(SQUASHES[config.squash], low, high)
+    features = len(task.state_names) + len(task.angles)
+    shared: dict[str, Any] = dict(
+        encode=partial(angles.encode, angles=task.angles),
+        controls=len(task.control_names),
+        saturate=to_limits(SQUASHES[config.squash], low, high),
+    )
     # Of the saturations, only the sine has moments in closed form.
     saturate_moments = partial(gaussian.squash, low=low, high=high) if config.squash == "sine" else None
     match config:
         case settings.RBF():
-            return rbf(
-                encode=encode,
-                start=partial(start, task=task),
-                waves=2 * len(task.angles),
-                controls=controls,
-                units=config.units,
-                saturate=saturate,
-                saturate_moments=saturate_moments,
+            centers: dict[str, Any] = dict(
+                start=partial(start, task=task), waves=2 * len(task.angles), units=config.units
             )
+            return rbf(**shared, **centers, saturate_moments=saturate_moments)
         case settings.Linear():
-            return linear(
-                encode=encode,
-                features=features,
-                controls=controls,
-                saturate=saturate,
-                saturate_moments=saturate_moments,
-            )
+            return linear(**shared, features=features, saturate_moments=saturate_moments)
         case settings.MLP():
             return mlp(
-                encode=encode,
+                **shared,
                 features=features,
-                controls=controls,
                 hidden=config.hidden,
                 dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
-                saturate=saturate,
                 initialiser=config.initialiser,
                 input_scale=tasks.input_scale(task, config.input_units),
             )

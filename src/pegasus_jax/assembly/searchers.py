@@ -13,7 +13,6 @@ from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching, scenarios
-from pegasus_jax.imagine.costs import of_particles
 from pegasus_jax.imagine.objective import either, objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
 from pegasus_jax.learn.multistart import best_of
@@ -22,22 +21,10 @@ from pegasus_jax.learn.search import Problem, sampler, searcher
 from pegasus_jax.pilco import search as pilco
 from pegasus_jax.policies.scaled import inherited
 from pegasus_jax.sharding import Spread, together
-from pegasus_jax.types import (
-    Array,
-    Dynamics,
-    Key,
-    Params,
-    Period,
-    Policy,
-    Rollout,
-    Scenarios,
-    Searcher,
-    Task,
-)
+from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, Rollout, Scenarios, Searcher, Task
 
-Imagine = Callable[
-    [Key, Params, Params], tuple[Rollout, Array]
-]  # (key, policy parameters, posterior) -> cost [H, K] too
+# (key, policy parameters, posterior) -> (rollout, cost [H, K])
+Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]
 
 AGGREGATES = {"mean": cost.mean, "total": cost.total}
 
@@ -225,7 +212,7 @@ def imagined(
 ) -> tuple[Rollout, Array]:
     """Rollouts under fresh scenarios and the cost of every particle [H, K]."""
     rolled = rollout(params, posterior, scenarios.draw(key, 0, posterior, blocks=blocks, period=Period()), **pieces)
-    return rolled, until_stop(task, of_particles(task.cost))(rolled.x[1:])
+    return rolled, until_stop(task, cost.of_particles(task.cost))(rolled.x[1:])
 
 
 def start(key: Key, *, task: Task) -> Array:

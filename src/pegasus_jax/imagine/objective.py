@@ -1,12 +1,13 @@
 """What a policy search minimizes: the imagined cost under given scenarios (Alg. 3, lines 6 to 15)."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 
 from pegasus_jax.imagine import costs
-from pegasus_jax.imagine.rollout import NoiseUse, rollout
-from pegasus_jax.types import Array, Dynamics, Params, Policy, Scenarios
+from pegasus_jax.imagine.rollout import rollout
+from pegasus_jax.types import Array, Params, Scenarios
 
 
 def objective(
@@ -14,26 +15,15 @@ def objective(
     posterior: Params,
     scenarios: Scenarios,
     *,
-    dynamics: Dynamics,
-    policy: Policy,
-    match: Callable[[Array, Array], Array],
     cost: Callable[[Array], Array],
     aggregate: Callable[[Array], Array] = costs.mean,
-    noise: NoiseUse = NoiseUse(),
-    limit: Array | float | None = None,
+    **how: Any,
 ) -> Array:
-    """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`."""
-    imagined = rollout(
-        policy_params,
-        posterior,
-        scenarios,
-        dynamics=dynamics,
-        policy=policy,
-        match=match,
-        noise=noise,
-        limit=limit,
-    )
-    return aggregate(cost(imagined.x[1:]))
+    """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`.
+
+    `how` are the keywords of `rollout`: dynamics, policy, match, and maybe noise and limit.
+    """
+    return aggregate(cost(rollout(policy_params, posterior, scenarios, **how).x[1:]))
 
 
 def either(condition: Array | None, yes: Callable[..., Array], no: Callable[..., Array]) -> Callable[..., Array]:

@@ -179,7 +179,7 @@ def close(task: Task) -> None:
 
 
 def _complete(config: Config) -> None:
-    """Raises ConfigError unless an environment is named, and a cost that there is: no robot is opened in vain."""
+    """Raises ConfigError unless an environment is named, and a cost that there is: no robot is opened for nothing."""
     if config.env is None or config.cost is None:
         raise ConfigError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
     user_code.load("cost", config.cost)
