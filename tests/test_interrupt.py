@@ -98,6 +98,16 @@ def test_a_signal_that_a_finalizer_loses_is_raised_again() -> None:
     assert time.monotonic() - began < 10
 
 
+def test_a_signal_while_an_extension_module_begins_is_raised_after_that() -> None:
+    """C++ that is called back by Python's initialization of it ends the process, where an exception passes it."""
+    begins = (
+        "exec('from importlib.machinery import ExtensionFileLoader\\nclass Begins(ExtensionFileLoader):\\n"
+        '    def exec_module(self, module):\\n        signal.raise_signal(2)\\n        print("begun", flush=True)\\n'
+        'Begins("module", "path").exec_module(None)\\ndone.wait(30)\')'
+    )
+    assert ended(begun(body=begins.replace("exec('", "exec('", 1))) == (130, ["begun", "closing", "closed"])
+
+
 def test_the_handlers_of_an_environment_are_called_and_do_not_hide_the_signal() -> None:
     body = (
         'exec(\'signal.signal(2, lambda *_: print("theirs", flush=True))\\n'

@@ -9,12 +9,14 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 from typing import Any
 
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
-PAUSE = 0.02  # seconds until a signal whose exception was lost is raised again
+PAUSE = 0.02  # seconds until a signal whose exception was lost, or could not be raised, is raised again
+LOADING = ("create_module", "exec_module")  # of a loader
 
 
 class Interrupted(KeyboardInterrupt):
@@ -159,7 +161,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
     if _State.repeated:
         _State.repeated = False
         if not (_State.closing or _State.held):
-            raise Interrupted(number)
+            _raise(number, frame)
         return
     _State.asked.append(number)
     other = _State.others.get(number)
@@ -171,6 +173,23 @@ def _handle(number: int, frame: FrameType | None) -> None:
     if (_State.closing and len(_State.asked) < 3) or (_State.held and len(_State.asked) == 1):
         return
     if len(_State.asked) == 1:
-        raise Interrupted(number)
+        _raise(number, frame)
+        return
     clean_up()
     os._exit(status())
+
+
+def _raise(number: int, frame: FrameType | None) -> None:
+    """Raise `Interrupted`; a moment later where an extension module begins, which that could end by SIGSEGV."""
+    if not _begins_extension(frame):
+        raise Interrupted(number)
+    threading.Thread(target=_repeat, args=(number,), daemon=True).start()
+
+
+def _begins_extension(frame: FrameType | None) -> bool:
+    """Whether the initialization of an extension module is among a frame and its callers."""
+    while frame is not None:
+        if frame.f_code.co_name in LOADING and isinstance(frame.f_locals.get("self"), ExtensionFileLoader):
+            return True
+        frame = frame.f_back
+    return False

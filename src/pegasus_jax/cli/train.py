@@ -8,7 +8,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax import interrupt
 from pegasus_jax.checks import ConfigError, whole
 from pegasus_jax.config import GYM, Config, Search, label
 
@@ -181,8 +180,7 @@ def _changeable(key: str) -> bool:
 
 def _join(options: dict[str, str]) -> None:
     """Join the other processes of a study, if there are any, through jax.distributed."""
-    with interrupt.held():  # what is raised while its extension modules begin ends the process by SIGSEGV
-        import jax
+    import jax
 
     given = {name for name in ("coordinator", "processes", "process") if name in options}
     if not given and options.get("distributed", "false") == "false":
