@@ -12,7 +12,7 @@ from scipy import stats
 from pegasus_jax.learn.fit import fit
 from pegasus_jax.models import dropout
 from pegasus_jax.models.bnn import bnn
-from pegasus_jax.models.noisy import HEADS
+from pegasus_jax.models.networks import HEADS
 from pegasus_jax.types import Batch, Dataset, Learner
 from probes import experience, network
 

@@ -17,7 +17,7 @@ from pegasus_jax.config import Config, Period
 from pegasus_jax.config_models import DROPOUTS
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.math.gaussian import affine
-from pegasus_jax.models.network import INITIALISERS
+from pegasus_jax.models.networks import INITIALISERS
 from pegasus_jax.pilco.gp import gp
 from pegasus_jax.pilco.ssgp import ssgp
 from pegasus_jax.policies.squash import SQUASHES

@@ -79,6 +79,18 @@ def test_shapes_and_dtype(name):
                 assert leaf.dtype == dtype
 
 
+def test_base_noise_is_uniform_and_never_at_an_end():
+    """Of the log-normal: a Kolmogorov-Smirnov test of all draws and of both halves, and neighbors do not depend."""
+    draws = np.asarray(dropout.log_normal().sample(jax.random.key(0), 100_000), float)
+    assert 0 < draws.min() < 1e-4
+    assert 1 - 1e-4 < draws.max() < 1
+    first, second = np.split(draws, 2)
+    for part in (draws, first, second):
+        assert stats.kstest(part, "uniform").pvalue > 0.01
+    for a, b in ((first, second), (draws[1::2], draws[::2])):
+        assert abs(np.corrcoef(a, b)[0, 1]) < 4 / np.sqrt(len(a))
+
+
 @every_kind
 def test_mean_of_masks_is_retain(name):
     kind = KINDS[name]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.models.network import ACTIVATIONS, INITIALISERS, MLP
+from pegasus_jax.models.networks import ACTIVATIONS, INITIALISERS, MLP
 
 
 def forward(params, x, masks):

@@ -1,1 +1,1 @@
-"""Mathematics that knows nothing of control: angles, scaling, Gaussians, quantiles."""
+"""Mathematics that knows nothing of control: angles, scaling, Gaussians."""

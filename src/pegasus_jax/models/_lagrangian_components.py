@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pegasus_jax.models.network import ACTIVATIONS
+from pegasus_jax.models.networks import ACTIVATIONS
 from pegasus_jax.types import Array
 
 # In units of the data's own deviations: the least diagonal of the mass matrix's factor, and the greatest change of a

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 
 from pegasus_jax.math.angles import encode
 from pegasus_jax.math.normalize import Whitener, unwhiten, whitener
-from pegasus_jax.models.noisy import HEADS, Head, Masks, nll, noisy
+from pegasus_jax.models.networks import HEADS, Head, Masks, nll, noisy
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 
 

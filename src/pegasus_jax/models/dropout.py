@@ -15,9 +15,9 @@ import math
 
 import jax
 import jax.numpy as jnp
+from jax.lax import erf_inv
 from jax.scipy.special import erf, log_ndtr
 
-from pegasus_jax.math.quantile import erf_inv, uniforms
 from pegasus_jax.types import Dropout
 
 # The log-uniform prior is improper, so its KL is known up to a constant. We fix the constant by KL -> 0 as alpha ->
@@ -90,7 +90,7 @@ def concrete(rate: float = 0.1, temperature: float = 0.1) -> Dropout:
 
     return Dropout(
         init=lambda key, width: {"logit": jnp.full((width,), start, float)},
-        sample=lambda key, width: _logit(uniforms(key, width)),
+        sample=lambda key, width: _logit(_uniform(key, width)),
         mask=lambda params, noise: jax.nn.sigmoid((noise - params["logit"]) / temperature),
         kl=kl,
         retain=retain,
@@ -201,7 +201,7 @@ def log_normal(
         upper, lower = log_ndtr(beta - sigma), log_ndtr(alpha - sigma)
         return jnp.exp(mu + 0.5 * sigma**2 + upper + jnp.log1p(-jnp.exp(lower - upper))) / _mass(alpha, beta)
 
-    return Dropout(init=init, sample=uniforms, mask=mask, kl=kl, retain=retain, decay=_undiminished)
+    return Dropout(init=init, sample=_uniform, mask=mask, kl=kl, retain=retain, decay=_undiminished)
 
 
 def _normal(name, start, log_alpha, kl):
@@ -226,6 +226,12 @@ def _relative_variance(rate):
     if not 0.0 < rate < 1.0:
         raise ValueError(f"the initial rate must be between 0 and 1, got {rate}")
     return rate / (1.0 - rate)
+
+
+def _uniform(key, width):
+    """[width] draws in (0, 1), the middles of 2^16 intervals: never an end, where a quantile is infinite."""
+    bits = jax.random.bits(key, ((width + 1) // 2,), jnp.uint32)  # two draws from each: .94 of a fit step
+    return (jnp.concatenate([bits >> 16, bits & 0xFFFF])[:width].astype(float) + 0.5) / 2**16
 
 
 def _logit(u):

@@ -11,7 +11,7 @@ import numpy as np
 from pegasus_jax.math.angles import encode
 from pegasus_jax.math.normalize import whitener
 from pegasus_jax.models._lagrangian_components import GREATEST_CHANGE, GREATEST_SPEED, LEAST_MASS, substituted
-from pegasus_jax.models.noisy import HEADS, Masks, noisy
+from pegasus_jax.models.networks import HEADS, Masks, noisy
 from pegasus_jax.sharding import alone_on_gpu
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 

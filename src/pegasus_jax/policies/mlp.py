@@ -6,7 +6,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from pegasus_jax.models.network import MLP
+from pegasus_jax.models.networks import MLP
 from pegasus_jax.policies.scaled import of_data, scaled, unscaled
 from pegasus_jax.types import Array, Dataset, Dropout, Key, Params, Policy
 
