@@ -12,8 +12,8 @@ import pytest
 from pegasus_jax import config
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.learn.multistart import best_of
-from pegasus_jax.learn.search import SearchInfo
 from pegasus_jax.types import Learner, Searcher
 from probes import cart, noisy_linear_policy, regression, same, tiny, unchecked
 

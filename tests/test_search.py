@@ -14,8 +14,10 @@ from scipy.optimize import minimize
 from pegasus_jax.imagine import costs, matching, scenarios
 from pegasus_jax.imagine.objective import objective
 from pegasus_jax.imagine.rollout import NoiseUse
+from pegasus_jax.imagine.scenarios import Sampler, sampler
+from pegasus_jax.learn.gradient import gradient_search
 from pegasus_jax.learn.schedule import search_table
-from pegasus_jax.learn.search import Problem, Sampler, gradient_search, sampler, searcher
+from pegasus_jax.learn.search import Problem, searcher
 from pegasus_jax.types import Learner, Period, Scenarios
 from probes import (
     EMITTERS,

@@ -17,20 +17,12 @@ if TYPE_CHECKING:
     from pegasus_jax.imagine import costs, matching
     from pegasus_jax.imagine.objective import objective
     from pegasus_jax.imagine.rollout import NoiseUse, rollout
-    from pegasus_jax.imagine.scenarios import Blocks, blocks, draw
+    from pegasus_jax.imagine.scenarios import Blocks, Sampler, blocks, draw, sampler
     from pegasus_jax.learn import data
     from pegasus_jax.learn.fit import FitInfo, fit, minibatches
+    from pegasus_jax.learn.gradient import SearchInfo, gradient_search
     from pegasus_jax.learn.schedule import SearchTable, search_table
-    from pegasus_jax.learn.search import (
-        Problem,
-        Sampler,
-        SearchInfo,
-        SearchState,
-        gradient_search,
-        sampler,
-        search,
-        searcher,
-    )
+    from pegasus_jax.learn.search import Problem, SearchState, search, searcher
     from pegasus_jax.math import angles, gaussian
     from pegasus_jax.models import dropout as dropouts
     from pegasus_jax.models.bnn import bnn
@@ -77,11 +69,12 @@ _NAMES = {
     "checks": "ConfigError RunError",
     "runs.controller": "controller Controller",
     # the method, function by function
-    "imagine.scenarios": "blocks Blocks draw",
+    "imagine.scenarios": "blocks Blocks draw sampler Sampler",
     "imagine.rollout": "rollout NoiseUse",
     "learn.fit": "fit FitInfo minibatches",
     "imagine.objective": "objective",
-    "learn.search": "gradient_search search searcher sampler Problem Sampler SearchInfo SearchState",
+    "learn.gradient": "gradient_search SearchInfo",
+    "learn.search": "search searcher Problem SearchState",
     "learn.schedule": "search_table SearchTable",
     # models and policies
     "models.bnn": "bnn",

@@ -12,7 +12,7 @@ from jax.core import Tracer
 from pegasus_jax import episode
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
-from pegasus_jax.learn.search import SearchInfo
+from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.models.calibration import calibration
 from pegasus_jax.shapes import check_shape
 from pegasus_jax.types import (

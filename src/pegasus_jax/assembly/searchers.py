@@ -17,7 +17,7 @@ from pegasus_jax.imagine.objective import either, objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
 from pegasus_jax.learn.multistart import best_of
 from pegasus_jax.learn.schedule import SearchTable, search_table
-from pegasus_jax.learn.search import Problem, sampler, searcher
+from pegasus_jax.learn.search import Problem, searcher
 from pegasus_jax.pilco import search as pilco
 from pegasus_jax.policies.scaled import inherited
 from pegasus_jax.sharding import Spread, together
@@ -72,7 +72,7 @@ def search_of(
 
     clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
-    draws = sampler(blocks, Period(**vars(search.period)))
+    draws = scenarios.sampler(blocks, Period(**vars(search.period)))
     found = searcher(Problem(value, draws, optimizer, table, search.reset))
     if search.starts > 1:
         lasting = search.anneal > 1  # one schedule for all searches: who began late would be behind

@@ -1,6 +1,7 @@
 """The only place that draws the noise of imagined rollouts."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -74,7 +75,7 @@ def draw(key: Key, step: Array | int, posterior: Params, *, blocks: Blocks, peri
 def redraw(
     key: Key, step: Array, scenarios: Scenarios, posterior: Params, *, blocks: Blocks, period: Period
 ) -> Scenarios:
-    """`draw` for the iteration after the one whose scenarios are given; draws only the blocks that change."""
+    """`draw` for an iteration, from those of it or of the one before; draws only the blocks that may change."""
     renewed = {}
     for every in sorted(set(period) - {0}):
         names = [name for name, p in zip(Scenarios._fields, period, strict=True) if p == every]
@@ -92,3 +93,15 @@ def redraw(
 
 def _epoch(step: Array | int, every: int) -> Array:
     return jnp.asarray(step // every if every else 0, jnp.uint32)
+
+
+class Sampler(NamedTuple):
+    """Where the scenarios of a search come from."""
+
+    draw: Callable[[Key, Array, Params], Scenarios]  # (key, iteration, posterior)
+    redraw: Callable[[Key, Array, Scenarios, Params], Scenarios]  # (key, iteration, those before it, posterior)
+
+
+def sampler(blocks: Blocks, period: Period) -> Sampler:
+    """Scenarios drawn from `blocks`, each held for its `period` of iterations."""
+    return Sampler(*(partial(function, blocks=blocks, period=period) for function in (draw, redraw)))

@@ -1,4 +1,4 @@
-"""Policy search: follow the gradient of the imagined cost under held scenarios (Alg. 3)."""
+"""Policy search by a table: Alg. 3 with comparisons, a width, step sizes and a refinement, as one loop over rows."""
 
 from collections.abc import Callable
 from functools import partial
@@ -8,30 +8,11 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from pegasus_jax.imagine import scenarios as drawing
+from pegasus_jax.imagine.scenarios import Sampler
+from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.learn.schedule import FRESH, START, STEP, SearchTable, first_rows
 from pegasus_jax.learn.updates import is_finite, update_if
-from pegasus_jax.types import Array, Key, Learner, Params, Period, Scenarios, Searcher
-
-
-class Sampler(NamedTuple):
-    """Where the scenarios of a search come from."""
-
-    draw: Callable[[Key, Array, Params], Scenarios]  # (key, iteration, posterior)
-    redraw: Callable[[Key, Array, Scenarios, Params], Scenarios]  # (key, iteration, those before it, posterior)
-
-
-def sampler(blocks: drawing.Blocks, period: Period) -> Sampler:
-    """Scenarios drawn from `blocks`, each held for its `period` of iterations."""
-    return Sampler(*(partial(function, blocks=blocks, period=period) for function in (drawing.draw, drawing.redraw)))
-
-
-class SearchInfo(NamedTuple):
-    """How a search went, iteration by iteration."""
-
-    objective: Array  # [steps]; where an iteration ends with a comparison, that of the policy that goes on
-    gradient_norm: Array  # [steps] before clipping
-    skipped: Array  # [] updates skipped because a gradient was not finite
+from pegasus_jax.types import Array, Key, Learner, Params, Searcher
 
 
 class SearchState(NamedTuple):
@@ -51,35 +32,6 @@ class Problem(NamedTuple):
     optimizer: optax.GradientTransformation  # any of optax
     table: SearchTable
     reset: bool = True  # whether each search starts with a new optimizer state
-
-
-def gradient_search(
-    key: Key,
-    learner: Learner,
-    posterior: Params,
-    *,
-    objective: Callable[[Params, Params, Scenarios], Array],
-    sampler: Sampler,
-    optimizer: optax.GradientTransformation,
-    steps: int,
-) -> tuple[Learner, SearchInfo]:
-    """Alg. 3 as printed: `steps` updates along the gradient of `objective` under the scenarios of each iteration.
-
-    The learner is policy parameters and `optimizer.init` of them. A gradient with a non-finite entry changes nothing.
-    """
-
-    def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], SearchInfo]:
-        learner, scenarios = carry
-        value, gradient = jax.value_and_grad(objective)(learner.params, posterior, scenarios)
-        finite = is_finite(gradient)
-        updates, state = update_if(finite, optimizer, gradient, learner, value=value)
-        learner = Learner(optax.apply_updates(learner.params, updates), state)
-        info = SearchInfo(value, optax.tree.norm(gradient), ~finite)
-        return (learner, sampler.redraw(key, i + 1, scenarios, posterior)), info
-
-    begun = learner, sampler.draw(key, jnp.int32(0), posterior)
-    (learner, _), info = jax.lax.scan(step, begun, jnp.arange(steps))
-    return learner, info._replace(skipped=jnp.sum(info.skipped))
 
 
 def searcher(problem: Problem) -> Searcher:
@@ -108,51 +60,32 @@ def search(
     may have as a candidate. All rows visit one objective: a second one would take as long again to compile. Raises
     ValueError for more iterations than the table has, and where its fresh policy is missing.
     """
-    table, draw, redraw = problem.table, problem.sampler.draw, problem.sampler.redraw
-    check(table, steps, fresh)
-    rows, begin = of_search(table, earlier), first_rows(table)
-    following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
-
-    def visit(r: Array, loop: Loop) -> Loop:
-        (params, state), info = loop.learner, loop.info
-        row: SearchTable = jax.tree.map(lambda column: column[r], rows)
-        scenarios = unpacked(loop.scenarios, drawn)
-        others = params if fresh is None else fresh, state.start, state.start
-        visited = jax.tree.map(lambda *those: jax.lax.select_n(row.candidate, *those), params, *others)
-        value, gradient = jax.value_and_grad(problem.objective)(visited, posterior, scenarios, row)
-        learner, cost, skipped = after(row, loop.learner, visited, value, gradient, problem.optimizer)
-        i = row.iteration - first
-        norm_of = jnp.where(row.action == STEP, i, steps)
-        info = SearchInfo(
-            info.objective.at[i].set(cost),
-            info.gradient_norm.at[norm_of].set(optax.tree.norm(gradient), mode="drop"),
-            info.skipped + skipped,
-        )
-        return Loop(learner, packed(redraw(key, following[r], scenarios, posterior)), info)
-
-    drawn = draw(key, jnp.asarray(first, jnp.int32), posterior)
-    none = jnp.full(steps, jnp.nan)
-    loop = Loop(begun(learner, first, problem), packed(drawn), SearchInfo(none, none, jnp.int32(0)))
-    row, end = (jnp.asarray(begin)[i] for i in (first, first + steps))
-    count = steps if len(table.action) == len(begin) - 1 else end - row  # a known number is quicker on a GPU
-    loop = jax.lax.fori_loop(0, count, lambda k, loop: visit(row + k, loop), loop)
-    return loop.learner, loop.info
-
-
-class Loop(NamedTuple):
-    """What one row of a search hands to the next."""
-
-    learner: Learner  # its optimizer is a SearchState
-    scenarios: Scenarios  # packed
-    info: SearchInfo
-
-
-def check(table: SearchTable, steps: int, fresh: Params | None) -> None:
-    """Raise ValueError where a table lacks what it is asked for, or what it needs."""
-    if steps > (most := len(first_rows(table)) - 1):
+    table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)
+    if steps > (most := len(begin) - 1):
         raise ValueError(f"steps={steps}: the table of this search has {most}")
     if fresh is None and FRESH in table.candidate:
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
+    rows = of_search(table, earlier)
+    row, end = (jnp.asarray(begin)[i] for i in (first, first + steps))
+    count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
+
+    def visit(k: Array, loop: tuple) -> tuple:
+        learner, scenarios, info = loop
+        now: SearchTable = jax.tree.map(lambda column: column[row + k], rows)
+        scenarios = sampler.redraw(key, now.scenarios, scenarios, posterior)
+        (own, state), choose = learner, partial(jax.lax.select_n, now.candidate)
+        visited = jax.tree.map(choose, own, own if fresh is None else fresh, state.start, state.start)
+        value, gradient = jax.value_and_grad(problem.objective)(visited, posterior, scenarios, now)
+        learner, cost, skipped = after(now, learner, visited, value, gradient, problem.optimizer)
+        i = now.iteration - first
+        stepped = jnp.where(now.action == STEP, i, steps)
+        norms = info.gradient_norm.at[stepped].set(optax.tree.norm(gradient), mode="drop")
+        return learner, scenarios, SearchInfo(info.objective.at[i].set(cost), norms, info.skipped + skipped)
+
+    scenarios, none = sampler.draw(key, jnp.asarray(first, jnp.int32), posterior), jnp.full(steps, jnp.nan)
+    loop = begun(learner, first, problem), scenarios, SearchInfo(none, none, jnp.int32(0))
+    learner, _, info = jax.lax.fori_loop(0, count, visit, loop)
+    return learner, info
 
 
 def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
@@ -165,10 +98,11 @@ def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
 
 def begun(learner: Learner, first: Array | int, problem: Problem) -> Learner:
     """The learner as the search has it: new at its iteration 0, later as it is."""
-    begins, state = jnp.asarray(first) == 0, learner.optimizer
-    fresh = problem.optimizer.init(learner.params) if problem.reset else state.optimizer
-    optimizer, start = optax.tree.where(begins, (fresh, learner.params), (state.optimizer, state.start))
-    return Learner(learner.params, state._replace(optimizer=optimizer, start=start))
+    params, state = learner
+    fresh = problem.optimizer.init(params) if problem.reset else state.optimizer
+    begins = jnp.asarray(first) == 0
+    optimizer, start = optax.tree.where(begins, (fresh, params), (state.optimizer, state.start))
+    return Learner(params, state._replace(optimizer=optimizer, start=start))
 
 
 def after(
@@ -180,29 +114,13 @@ def after(
     optimizer: optax.GradientTransformation,
 ) -> tuple[Learner, Array, Array]:
     """What a row makes of the cost and gradient of what it visited -> (learner, cost of its parameters, skipped)."""
-    (params, state), finite = learner, is_finite(gradient)
+    (params, state), finite, steps_now = learner, is_finite(gradient), row.action == STEP
     # NaN decides for the older policy, a tie for the other one: where the cost is flat, nothing else leads away.
     older = ~(state.last < value)
-    taken = jnp.stack([True, (value <= state.last) | state.no_improvement, older, older])[row.candidate]
-    steps_now = row.action == STEP
-    taken |= steps_now
+    taken = jnp.stack([True, (value <= state.last) | state.no_improvement, older, older])[row.candidate] | steps_now
     params = optax.tree.where(taken, visited, params)
     updates, moved = update_if(steps_now & finite, optimizer, gradient, Learner(params, state.optimizer), value=value)
     start = optax.tree.where(row.candidate >= START, params, state.start)
-    state = SearchState(moved, start, value, jnp.where(row.candidate == START, taken, state.no_improvement))
+    found = SearchState(moved, start, value, jnp.where(row.candidate == START, taken, state.no_improvement))
     params = optax.apply_updates(params, optax.tree.scale(row.step_size, updates))
-    return Learner(params, state), jnp.where(taken, value, learner.optimizer.last), steps_now & ~finite
-
-
-def packed(scenarios: Params) -> Params:
-    """As one iteration hands them to the next: noise [H, K, D] as [H, K D].
-
-    A CPU's compiler draws an array in the shape it is kept in, and rows of six dimensions take it five times as
-    long as rows of hundreds.
-    """
-    return jax.tree.map(lambda leaf: leaf.reshape(len(leaf), -1) if leaf.ndim > 2 else leaf, scenarios)
-
-
-def unpacked(packed: Params, like: Params) -> Params:
-    """The scenarios that were packed, in the shapes of `like`."""
-    return jax.tree.map(lambda leaf, shaped: leaf.reshape(shaped.shape), packed, like)
+    return Learner(params, found), jnp.where(taken, value, state.last), steps_now & ~finite

@@ -14,7 +14,7 @@ import optax
 
 from pegasus_jax.imagine import costs
 from pegasus_jax.imagine.rollout import NoiseUse
-from pegasus_jax.learn.search import SearchInfo
+from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.math.gaussian import Image, chain, joint, residual, sincos
 from pegasus_jax.pilco import lbfgs
 from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Policy, Searcher

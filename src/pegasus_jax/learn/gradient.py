@@ -1,0 +1,49 @@
+"""Policy search as printed (Alg. 3): follow the gradient of the imagined cost under held scenarios."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import optax
+
+from pegasus_jax.imagine.scenarios import Sampler
+from pegasus_jax.learn.updates import is_finite, update_if
+from pegasus_jax.types import Array, Key, Learner, Params, Scenarios
+
+
+class SearchInfo(NamedTuple):
+    """How a search went, iteration by iteration."""
+
+    objective: Array  # [steps]; where an iteration ends with a comparison, that of the policy that goes on
+    gradient_norm: Array  # [steps] before clipping
+    skipped: Array  # [] updates skipped because a gradient was not finite
+
+
+def gradient_search(
+    key: Key,
+    learner: Learner,
+    posterior: Params,
+    *,
+    objective: Callable[[Params, Params, Scenarios], Array],
+    sampler: Sampler,
+    optimizer: optax.GradientTransformation,
+    steps: int,
+) -> tuple[Learner, SearchInfo]:
+    """Alg. 3 as printed: `steps` updates along the gradient of `objective` under the scenarios of each iteration.
+
+    The learner is policy parameters and `optimizer.init` of them. A gradient with a non-finite entry changes nothing.
+    """
+
+    def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], SearchInfo]:
+        learner, scenarios = carry
+        value, gradient = jax.value_and_grad(objective)(learner.params, posterior, scenarios)
+        finite = is_finite(gradient)
+        updates, state = update_if(finite, optimizer, gradient, learner, value=value)
+        learner = Learner(optax.apply_updates(learner.params, updates), state)
+        info = SearchInfo(value, optax.tree.norm(gradient), ~finite)
+        return (learner, sampler.redraw(key, i + 1, scenarios, posterior)), info
+
+    begun = learner, sampler.draw(key, jnp.int32(0), posterior)
+    (learner, _), info = jax.lax.scan(step, begun, jnp.arange(steps))
+    return learner, info._replace(skipped=jnp.sum(info.skipped))
