@@ -207,3 +207,32 @@ ROLLOUT = "imagine.rollout (layer 2) imports"
 )
 def test_checker_catches(tmp_path: Path, file: str, text: str, complaint: str) -> None:
     assert any(complaint in problem for problem in violations(plant(tmp_path, {file: text})))
+
+
+# Functions of the method are short enough to be read at once.
+
+LONGEST, MOST_PARAMETERS = 60, 8
+
+
+def too_large(source: str) -> list[str]:
+    """Functions of more lines or parameters than a reader holds in mind."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef):
+            a, lines = node.args, (node.end_lineno or node.lineno) - node.lineno + 1
+            count = len([*a.posonlyargs, *a.args, *a.kwonlyargs])
+            if lines > LONGEST or count > MOST_PARAMETERS:
+                found.append(f"{node.name}: {lines} lines, {count} parameters")
+    return found
+
+
+@pytest.mark.parametrize("folder", ["learn", "imagine"])
+def test_functions_of_the_method_are_small(folder: str) -> None:
+    files = sorted((ROOT / "src" / "pegasus_jax" / folder).glob("*.py"))
+    assert not [f"{path.name}: {what}" for path in files for what in too_large(path.read_text(encoding="utf-8"))]
+
+
+def test_a_large_function_is_found() -> None:
+    assert too_large("def f(a, b, c, d, e, *, g, h, i, j): pass") == ["f: 1 lines, 9 parameters"]
+    assert too_large("def f():\n" + "    x = 1\n" * LONGEST) == [f"f: {LONGEST + 1} lines, 0 parameters"]
+    assert not too_large("def f():\n" + "    x = 1\n" * (LONGEST - 1))
