@@ -9,8 +9,11 @@ BIN   := $(VENV)/bin
 STAMP := $(VENV)/.installed
 CODE  := $(wildcard src envs tests benchmarks)
 
+# A file's tests share what they compile, so a file stays on one core.
+PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations 10
+
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-slow check format bench bench-compare figures docs lock clean
+.PHONY: help setup train test test-slow campaigns check format bench bench-compare figures docs lock clean
 .DELETE_ON_ERROR:
 
 help: ## list the targets
@@ -23,11 +26,14 @@ setup: $(STAMP) ## make .venv with the locked dependencies and this project (aga
 train: $(STAMP) ## learn the cart-pole swing-up; settings: make train ARGS="trials=3 seed=1"
 	$(BIN)/pegasus-train $(if $(filter task=% resume=% --help -h,$(ARGS)),,task=cartpole) $(ARGS)
 
-test: $(STAMP) ## run the tests on JOBS=2 cores; some of them: make test ARGS="-k layers"
-	$(BIN)/python -m pytest -m "not slow" -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations 10 $(ARGS)
+test: $(STAMP) ## run the quick tests on JOBS=2 cores, within 8 minutes; some of them: make test ARGS="-k layers"
+	$(PYTEST) -m "not slow and not campaign" $(ARGS)
 
-test-slow: $(STAMP) ## run the long campaigns of kills, damages, bad commands and stops: an hour or more
-	$(BIN)/python -m pytest -m slow $(ARGS)
+test-slow: $(STAMP) ## run the tests that make test leaves out: whole runs, kills, the pages of docs/, short campaigns
+	$(PYTEST) -m "slow and not campaign" $(ARGS)
+
+campaigns: $(STAMP) ## run the long campaigns of kills, damages, bad commands and stops: an hour or more
+	$(BIN)/python -m pytest -m campaign $(ARGS)
 
 check: $(STAMP) ## formatting, lint, types, layers: everything that needs no training
 	$(BIN)/ruff format --check $(CODE)

@@ -27,13 +27,30 @@ settings.register_profile("repository", deadline=None, derandomize=True, max_exa
 settings.load_profile("repository")
 
 
-# The files that take minutes: begun first, so that at the end no processor waits for another's last file.
-LONG = ("test_family", "test_train", "test_seeds", "test_docs", "test_figures", "test_tasks", "test_build", "test_play")
+# The files that take minutes: begun first, so that at the end no core waits for another's last file.
+LONG = ("test_train", "test_docs", "test_family", "test_seeds", "test_figures", "test_tasks", "test_build", "test_play")
+QUICK = 30  # CPU seconds that a test of `make test` may take; those there are take up to 10
 
 
 def pytest_collection_modifyitems(items):
     """Long files first, otherwise as they came."""
     items.sort(key=lambda item: LONG.index(item.path.stem) if item.path.stem in LONG else len(LONG))
+
+
+def pytest_runtest_setup(item):
+    if item.get_closest_marker("gpu") and jax.default_backend() != "gpu":
+        pytest.skip("needs a GPU")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_call(item):
+    """A test that takes long has to say so. CPU time, its processes' too: it hardly depends on what else is running."""
+    began = os.times()
+    result = yield
+    spent = sum(os.times()[:4]) - sum(began[:4])
+    if spent > QUICK and not item.get_closest_marker("slow") and not item.get_closest_marker("campaign"):
+        pytest.fail(f"took {spent:.0f} s of CPU time; above {QUICK} s: mark it slow, or make it quicker", pytrace=False)
+    return result
 
 
 @pytest.fixture

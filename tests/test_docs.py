@@ -121,6 +121,7 @@ def shell(command: str, folder: Path, environment: dict[str, str]) -> None:
     assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", RUN)
 def test_a_page_runs_from_the_top_to_the_end(page: Path, tmp_path: Path, tools: dict[str, str]) -> None:
     for name in CHECKOUT:

@@ -152,6 +152,7 @@ def test_an_environment_that_is_one_object_is_refused():
         study(Config(task="gym"), [0])
 
 
+@pytest.mark.slow
 def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
     (tmp_path / "mine.toml").write_text(TINY)
     first = call("figures", "mine.toml", "out=there", "variants=loose", cwd=tmp_path)
@@ -184,6 +185,7 @@ def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
     assert (out / "mine.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_the_cores_of_a_processor_share_the_seeds_of_a_study(tmp_path):
     """The command makes a device of each of two cores; here there is one. The numbers are those of one program."""
     figure = figure_of(tmp_path, TINY)

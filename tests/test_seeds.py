@@ -36,6 +36,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_seed_among_others_leaves_what_it_leaves_alone(study: Path, tmp_path: Path) -> None:
     """The same files with the same numbers, up to the order in which a batched product adds."""
     alone, among = tmp_path / "alone", study / "seed2"
@@ -98,6 +99,7 @@ def test_a_gpu_is_told_how_to_run_loops_unless_the_user_says(monkeypatch: pytest
     assert {*programs.compiler_options(programs.LASTING)} == {abreast}
 
 
+@pytest.mark.slow
 def test_how_it_is_compiled_changes_no_result() -> None:
     """Graphs of kernels where these tests run on a GPU, wide vectors on a processor. A few steps: rounding grows."""
     experiment = compose(tiny(), cart())
@@ -111,6 +113,7 @@ def test_how_it_is_compiled_changes_no_result() -> None:
         jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4), as_a_run, plainly)
 
 
+@pytest.mark.slow
 def test_the_cores_of_a_processor_share_the_seeds(study: Path) -> None:
     """Two of them for two seeds; on a machine of one there is nothing to share."""
     devices = json.loads((study / "seed1" / "run.json").read_text())["devices"]
@@ -134,6 +137,7 @@ print(sum("XLAEigen" in path.read_text() for path in pathlib.Path("/proc/self/ta
     assert int(found.stdout) == (threads or machine.processors())
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_is_bit_equal(study: Path, tmp_path: Path) -> None:
     """Killed when one seed's second episode is on disk and the other's perhaps not."""
     folder = tmp_path / "killed"
@@ -161,6 +165,7 @@ def alike(study: Path, other: Path) -> None:
                 assert a[name] == pytest.approx(b[name], abs=2e-4), (seed, name)
 
 
+@pytest.mark.slow
 def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_path: Path) -> None:
     """Four devices made of this processor, two for the seeds and two for the particles; resumed on one device."""
     folder, words = tmp_path / "mesh", [*WORDS, "trials=1", "seeds=2", "mesh=2x2"]
@@ -170,6 +175,7 @@ def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_
     alike(study, folder)
 
 
+@pytest.mark.slow
 def test_processes_that_act_as_one_machine_change_nothing(study: Path, tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -204,6 +210,7 @@ def test_devices_that_are_not_there_are_one_clear_line(word: str, message: str, 
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_a_folder_of_seeds_is_drawn_and_kept(study: Path) -> None:
     plotted = call("plot", study, cwd=study.parent)
     assert plotted.returncode == 0, plotted.stderr

@@ -86,6 +86,7 @@ def test_an_unknown_task_is_named() -> None:
         tasks.make("double_cartpol")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words", [["task=double_cartpole", "model.substeps=1"], ["task=swimmer_knife_edge", "legs=2"]], ids=" ".join
 )

@@ -84,6 +84,7 @@ def test_a_run_leaves_everything(whole: Path) -> None:
     assert "jax" in about["versions"]
 
 
+@pytest.mark.slow
 def test_nothing_is_learned_between_random_episodes(tmp_path: Path) -> None:
     run = tmp_path / "run"
     done = call("train", *TINY, "explore.trials=2", f"out={run}", cwd=tmp_path)
@@ -107,7 +108,13 @@ def test_episodes_can_be_read_without_us(whole: Path) -> None:
         assert np.all(np.abs(file["u"]) <= 10)
 
 
-@pytest.mark.parametrize("moment", ["first episode", "second episode", "second imagined", "third episode"])
+@pytest.mark.parametrize(
+    "moment",
+    [
+        "second imagined",
+        *(pytest.param(f"{n} episode", marks=pytest.mark.slow) for n in ("first", "second", "third")),
+    ],
+)
 def test_killed_and_resumed_is_bit_equal(whole: Path, tmp_path: Path, moment: str) -> None:
     """kill -9 as soon as a certain file appears, at several points of a trial."""
     run = tmp_path / "killed"
@@ -135,6 +142,7 @@ def test_killed_and_resumed_is_bit_equal(whole: Path, tmp_path: Path, moment: st
     assert not [path for path in run.rglob(".*") if path.name != ".lock"]
 
 
+@pytest.mark.slow
 def test_an_episode_on_disk_takes_the_place_of_the_plant(whole: Path, tmp_path: Path) -> None:
     """After a crash the episode that was run is used, though the plant could not repeat it."""
     run = copy_until(whole, tmp_path / "run", 1)
@@ -148,6 +156,7 @@ def test_an_episode_on_disk_takes_the_place_of_the_plant(whole: Path, tmp_path: 
     assert fingerprint(run) != fingerprint(whole)
 
 
+@pytest.mark.slow
 def test_a_damaged_checkpoint_is_named_and_the_one_before_used(whole: Path, tmp_path: Path) -> None:
     run = copy_until(whole, tmp_path / "run", 2)
     victim = max((run / "checkpoints" / "0002").rglob("*"), key=lambda p: p.stat().st_size if p.is_file() else -1)
@@ -159,6 +168,7 @@ def test_a_damaged_checkpoint_is_named_and_the_one_before_used(whole: Path, tmp_
     assert fingerprint(run) == fingerprint(whole)
 
 
+@pytest.mark.slow
 def test_all_checkpoints_damaged_starts_from_the_episodes(whole: Path, tmp_path: Path) -> None:
     run = copy_until(whole, tmp_path / "run", 2)
     for sums in (run / "checkpoints").glob("*.json"):
@@ -167,6 +177,7 @@ def test_all_checkpoints_damaged_starts_from_the_episodes(whole: Path, tmp_path:
     assert fingerprint(run) == fingerprint(whole)
 
 
+@pytest.mark.slow
 def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_path: Path) -> None:
     """As those of an older version may be, whose model was another. Resuming begins with the data."""
     run = copy_until(whole, tmp_path / "run", 2)
@@ -190,6 +201,7 @@ def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_pa
     assert call("evaluate", str(run), cwd=tmp_path).returncode == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lines", [[], [0, 2], [0, 0, 1, 2]], ids=["gone", "a row less", "a row twice"])
 def test_rows_that_were_lost_are_found_again(lines: list[int], whole: Path, tmp_path: Path) -> None:
     """That is said; the trials are done again, from the episodes, with the same result."""
@@ -207,6 +219,7 @@ def test_rows_that_were_lost_are_found_again(lines: list[int], whole: Path, tmp_
     assert fingerprint(run) == fingerprint(whole)
 
 
+@pytest.mark.slow
 def test_a_file_that_the_disk_refuses_ends_the_command_in_one_line(whole: Path, tmp_path: Path) -> None:
     """A limit on the size of files stops the first large one; without it the run goes on."""
     command = shlex.join([*program("train"), *TINY, "out=run"])
@@ -222,6 +235,7 @@ def test_a_file_that_the_disk_refuses_ends_the_command_in_one_line(whole: Path, 
     assert timeless(tmp_path / "run") == timeless(whole)
 
 
+@pytest.mark.slow
 def test_the_policy_of_a_trial_is_evaluated(whole: Path, tmp_path: Path) -> None:
     rows = store.trials(whole)
     best = store.best_trial(rows)
@@ -237,6 +251,7 @@ def test_the_policy_of_a_trial_is_evaluated(whole: Path, tmp_path: Path) -> None
         assert says in done.stderr
 
 
+@pytest.mark.slow
 def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:
     run = copy_until(whole, tmp_path / "run", 9)
     done = call("train", f"resume={run}", "trials=4", cwd=tmp_path)
@@ -247,6 +262,7 @@ def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:
     assert "at least 4" in fewer.stderr
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_with_another_search(whole: Path, tmp_path: Path) -> None:
     """Also with one whose optimizer remembers more; what was learned and written before stays as it is."""
     run = copy_until(whole, tmp_path / "run", 9)
@@ -273,6 +289,7 @@ def test_two_processes_cannot_write_to_one_run(whole: Path, tmp_path: Path) -> N
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_eval_and_plot_work_while_a_run_goes_on(whole: Path, tmp_path: Path) -> None:
     run = copy_until(whole, tmp_path / "run", 2)
     with store.lock(run):

@@ -1,4 +1,4 @@
-"""A few cases of every campaign, and that each can fail. The long forms are marked slow: make test-slow."""
+"""A few cases of every campaign (make test-slow), all of them (make campaigns), and that each can fail."""
 
 from __future__ import annotations
 
@@ -42,12 +42,13 @@ def result(name: str, cases: int, folder: Path) -> dict[str, Any]:
     return json.loads(out.read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHORT)
 def test_short(name: str, folder: Path) -> None:
     assert result(name, SHORT[name], folder)["problems"] == []
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize("name", LONG)
 def test_long(name: str, folder: Path) -> None:
     assert result(name, LONG[name], folder)["problems"] == []
