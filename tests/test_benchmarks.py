@@ -172,6 +172,7 @@ def test_a_peer_that_does_other_work_is_refused(found):
         agreed("peer", found)
 
 
+@pytest.mark.slow
 def test_searches_from_fresh_policies_are_judged_side_by_side(tmp_path, capsys, monkeypatch):
     seen, real = [], searches.searched
 

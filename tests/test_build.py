@@ -50,8 +50,15 @@ def test_every_dropout_is_the_one_of_its_name(kind):
         np.testing.assert_allclose(short, np.exp(-4), rtol=1e-2)  # the interval is the one given
 
 
-@pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("policy", POLICIES)
+# Of make test: each model once, each policy twice.
+VARIANTS = [
+    pytest.param(model, policy, marks=() if (i - j) % len(POLICIES) == 0 else pytest.mark.slow)
+    for i, model in enumerate(MODELS)
+    for j, policy in enumerate(POLICIES)
+]
+
+
+@pytest.mark.parametrize(("model", "policy"), VARIANTS)
 def test_every_variant_has_the_shapes_of_the_loop(model, policy):
     """eval_shape traces the loop without compiling it."""
     task = cart() if model == "lagrangian" else dial()  # which has no rates
@@ -180,6 +187,7 @@ def small_pilco(model, policy, task, **search):
     return compose(dataclasses.replace(tiny(trials=2), **sections), task, dynamics=dynamics)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "policy", "task"),
     [
@@ -247,6 +255,7 @@ def test_pilco_without_moments_is_refused(policy, pieces, part):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_the_settings_of_pilcos_search_reach_its_objective():
     change = jnp.asarray(np.hstack([PENDULUM.a - np.eye(2), PENDULUM.b]), jnp.float32)
     dynamics = known(PENDULUM, noise_std=0.2)._replace(moments=lambda _, mean, cov: affine(mean, cov, change))

@@ -25,16 +25,6 @@ from pegasus_jax.types import Dataset, Learner
 from probes import PENDULUM, cart, known, linear_policy, tiny
 
 
-def eagerly(function):
-    """Operation by operation: for one step of a tiny search, nine times faster than compiling it."""
-
-    def call(*arguments):
-        with jax.disable_jit():
-            return function(*arguments)
-
-    return call
-
-
 def searcher(gain=-0.5, scatter=0.0, **search):
     """An experiment under a config, its first state, and a one-step search from it, which weighs no fresh policy."""
     plain = {"steps": 1, "particles": 5, "cost": "particles", "widen": 1.0, "restart": False}
@@ -43,7 +33,7 @@ def searcher(gain=-0.5, scatter=0.0, **search):
         init=lambda key: gain * jnp.array([[1.0, 1.6]]) + scatter * jax.random.normal(key, (1, 2))
     )
     exp = compose(chosen, cart(horizon=2), dynamics=known(PENDULUM, noise_std=0.2), policy=policy)
-    return exp, exp.init(jax.random.key(0)), eagerly(exp.search)
+    return exp, exp.init(jax.random.key(0)), jax.jit(exp.search)
 
 
 def first_objective(**search):
@@ -70,7 +60,7 @@ def test_a_search_starts_with_the_wider_cost_and_ends_with_the_tasks(of):
     chosen = dataclasses.replace(tiny(), search=config.Search(steps=1, particles=5, cost=of, widen=1.0))
     exp, state, _ = searcher()
     by_hand = compose(chosen, halved, dynamics=exp.dynamics, policy=exp.policy).search
-    np.testing.assert_allclose(wide, eagerly(by_hand)(state)[1].objective[0], rtol=1e-5)
+    np.testing.assert_allclose(wide, jax.jit(by_hand)(state)[1].objective[0], rtol=1e-5)
     slow = dict(cost=of, steps=4, learning_rate=1e-30)
     narrowed, plain = (searcher(**slow, widen=widen) for widen in (2.0, 1.0))
     values = [run(state)[1].objective for _, state, run in (narrowed, plain)]
@@ -103,7 +93,7 @@ def test_a_search_that_found_a_better_policy_refines_that():
     _, state, run = searcher(gain=-0.1, refine=0.5, **better, **HELD)
     after, info = run(state)
     exp, _, _ = searcher(gain=-0.1, **better, **HELD)
-    found, _ = eagerly(partial(exp.search, steps=2))(state)
+    found, _ = jax.jit(partial(exp.search, steps=2))(state)
     _, _, alone = searcher(learning_rate=1e-30, **ALONE)
     np.testing.assert_allclose(info.objective[2], alone(found)[1].objective[0], rtol=1e-5)
     assert alone(after)[1].objective[0] < info.objective[2] < alone(state)[1].objective[0]
@@ -161,7 +151,7 @@ def test_what_refines_is_imagined_as_it_was_searched():
 
     def fresh(**search):
         exp, state, _ = searcher(**search)
-        return eagerly(exp.imagine)(state)[1]
+        return jax.jit(exp.imagine)(state)[1]
 
     assert np.array_equal(fresh(refine=0.5), fresh(match=False))
     assert not np.array_equal(fresh(refine=0.0), fresh(match=False))
@@ -169,7 +159,7 @@ def test_what_refines_is_imagined_as_it_was_searched():
 
 def test_a_refining_search_in_parts_is_the_whole():
     exp, state, run = searcher(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
-    part, parts = eagerly(partial(exp.search, steps=1)), state
+    part, parts = jax.jit(partial(exp.search, steps=1)), state
     for first in range(4):
         parts, _ = part(parts, first)
     whole = run(state)[0].policy
@@ -303,7 +293,7 @@ def test_each_factor_of_the_noise_reaches_its_place():
 
     def imagined(**search):
         exp, state, _ = searcher(**{"match": False, "policy_noise": 0.0, **search})
-        return eagerly(exp.imagine)(state)[0]
+        return jax.jit(exp.imagine)(state)[0]
 
     plain = imagined()
     blur = np.asarray(imagined(state_noise=1.0).x[1] - plain.x[1])

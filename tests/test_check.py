@@ -116,6 +116,7 @@ def test_training_notes_what_checking_does(tmp_path: Path) -> None:
         assert part in "\n".join(notes)
 
 
+@pytest.mark.slow
 def test_a_mujoco_file_is_checked_without_a_robot(tmp_path: Path) -> None:
     (tmp_path / "arm.xml").write_text(
         '<mujoco><worldbody><body><joint name="j" type="hinge" axis="0 1 0" damping=".05"/><geom type="capsule"'

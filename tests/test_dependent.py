@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from pegasus_jax.runs import store
 
@@ -38,6 +39,7 @@ WORDS = "task=gym env=robot:Tip-v0 cost=robot:cost angles=[0] horizon=40 trials=
 TINY = "search.steps=20 search.particles=30 model.hidden=[20] policy.hidden=[20] out=run"
 
 
+@pytest.mark.slow
 def test_every_update_is_finite(tmp_path: Path) -> None:
     """An angle, its tip's height, the angle in degrees, a constant and 1e4: each update of fit and search counts."""
     (tmp_path / "robot.py").write_text(ROBOT)

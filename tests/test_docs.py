@@ -52,7 +52,7 @@ def commands(block: Block) -> list[str]:
 FILES = [block for page in PAGES for block in blocks(page) if block.file]
 USED = re.compile(r"\bruns/")  # a program that reads a run is one of a page's commands
 PROGRAMS = [
-    pytest.param(block.text, id=f"{page.stem}-{number}")
+    pytest.param(block.text, id=f"{page.stem}-{number}", marks=() if page.stem == "README" else pytest.mark.slow)
     for page in PAGES
     for number, block in enumerate(blocks(page))
     if block.kind == "python" and not block.file

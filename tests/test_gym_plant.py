@@ -40,7 +40,10 @@ def train(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.parametrize(
     ("env", "cost", "states", "limit"),
-    [("Pendulum-v1", "costs:upright", 3, 2.0), ("InvertedDoublePendulum-v5", "costs:balanced", 9, 1.0)],
+    [
+        ("Pendulum-v1", "costs:upright", 3, 2.0),
+        pytest.param("InvertedDoublePendulum-v5", "costs:balanced", 9, 1.0, marks=pytest.mark.slow),
+    ],
 )
 def test_an_environment_not_written_for_us(env: str, cost: str, states: int, limit: float, tmp_path: Path) -> None:
     """What the run stored is what Gymnasium says: the same controls from the same start give the same observations."""

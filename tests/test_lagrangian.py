@@ -93,6 +93,7 @@ def predictions(model, posterior, x, u, draws=20):
     return jax.jit(jax.vmap(one))(keys)
 
 
+@pytest.mark.slow
 def test_it_learns_a_mechanism_from_six_episodes(fitted, data):
     """The next two to 5 % of what changes, at the median; a network of changes is at 10 to 30 % then."""
     model, posterior = fitted

@@ -91,6 +91,7 @@ def command(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*program, *map(str, words)], cwd=cwd, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_learns_and_resumes_from_the_command_line(tmp_path: Path) -> None:
     (tmp_path / "cart.xml").write_text(PENDULUM.read_text())
     words = ["task=mjcf", "mjcf=cart.xml", "cost=costs:upright", "dt=0.04", "horizon=8", "angles=[1]", *TINY]
@@ -199,6 +200,7 @@ def test_flags_that_change_nothing_are_cleared(tmp_path: Path) -> None:
     assert mjcf_plant.read(path).opt.enableflags == 0
 
 
+@pytest.mark.slow
 def test_what_mjx_simulates_as_mujoco_does_is_let_through(pendulum: mjcf_plant.Mechanism, tmp_path: Path) -> None:
     mjcf_check.compare(pendulum)
     mjcf_check.compare(arm(tmp_path / "arm.xml"))

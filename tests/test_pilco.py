@@ -362,6 +362,7 @@ def test_the_search_finds_the_best_gain(plant):
     assert int(info.skipped) == 0
 
 
+@pytest.mark.slow
 def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     searcher, run = linear_search(PENDULUM)
     gain = jnp.zeros((1, 2))

@@ -1,4 +1,4 @@
-"""pegasus-play: a film that can be watched, from a run that has barely begun."""
+"""pegasus-play: a film that can be watched, of a policy that was drawn and not learned."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 
+from folders import a_run
 from pegasus_envs import mjcf_plant
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.runs import config_io
@@ -19,8 +20,6 @@ from pegasus_jax.types import Trajectory
 from pegasus_jax.viz.video import HEIGHT, STRIP, WIDTH, composed, performance, pictures, strip
 from test_train import call
 
-TINY = ["task=cartpole", "model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "trials=1"]
-TINY += ["search.particles=8"]
 ARM = """<mujoco><worldbody><body><joint name="elbow" type="hinge" axis="0 1 0"/>
 <geom type="capsule" size=".03" fromto="0 0 0 0 0 -.5"/></body></worldbody>
 <actuator><{motor} joint="elbow" ctrlrange="-2 2"/></actuator></mujoco>"""
@@ -30,12 +29,10 @@ OPTIMISED = {"JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}  # twenty episodes take long
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "run"
-    done = call("train", *TINY, f"out={folder}", cwd=folder.parent, **OPTIMISED)
-    assert done.returncode == 0, done.stderr
-    return folder
+    return a_run(tmp_path_factory.mktemp("runs") / "run", trials=1)
 
 
+@pytest.mark.slow
 def test_a_film_of_a_tiny_run(run: Path) -> None:
     done = call("play", run, "seed=3", cwd=run.parent, **OPTIMISED)
     assert (done.returncode, done.stderr) == (0, "")
@@ -51,7 +48,10 @@ def test_a_film_of_a_tiny_run(run: Path) -> None:
     assert np.abs(first[HEIGHT:] - last[HEIGHT:]).max() > 50  # and the curves have appeared
 
 
-@pytest.mark.parametrize("name", ["cartpole", "double_cartpole", "swimmer_corkscrew", *MOTORS])
+@pytest.mark.parametrize(
+    "name",
+    ["cartpole", *(pytest.param(n, marks=pytest.mark.slow) for n in ("double_cartpole", "swimmer_corkscrew")), *MOTORS],
+)
 def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
     """Also one whose state has a part without entries, as an arm's whose motor has no state of its own."""
     words = {"task": name, "policy.hidden": "[8]"}
@@ -71,6 +71,7 @@ def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
     assert drawn.std() > 0  # something is to be seen
 
 
+@pytest.mark.slow
 def test_a_film_replaces_a_link_and_what_it_leads_to_stays(run: Path, tmp_path: Path) -> None:
     """Neither where the film goes nor where it is written is a file that was there opened."""
     kept = tmp_path / "kept"

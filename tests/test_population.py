@@ -107,6 +107,7 @@ def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_
     assert not np.any(np.isclose(second.optimizer.params[1:], begun(first.optimizer.params).params[1:], rtol=1e-3))
 
 
+@pytest.mark.slow
 def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():
     chosen = tiny(trials=2, fit__steps=5, search__steps=4, search__particles=5, search__starts=3)
     exp = compose(chosen, cart(), dynamics=regression(2, 1), policy=noisy_linear_policy(cart()))

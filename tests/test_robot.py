@@ -90,6 +90,7 @@ def learned(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return home
 
 
+@pytest.mark.slow
 def test_a_robot_moves_for_the_episodes_that_are_data_and_for_nothing_else(learned: Path) -> None:
     """One reset to check it, a reset and a horizon of steps a trial; going on opens it again, a look at the run not."""
     trial = ["reset", *["step"] * 5]
@@ -106,6 +107,7 @@ def test_a_robot_moves_for_the_episodes_that_are_data_and_for_nothing_else(learn
     assert (code, asked(learned)) == (0, [*trial, *trial, "close"]), err
 
 
+@pytest.mark.slow
 def test_what_it_learned_is_a_function(learned: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(learned)
     control = controller("run")
@@ -123,6 +125,7 @@ def test_what_it_learned_is_a_function(learned: Path, monkeypatch: pytest.Monkey
         controller("nowhere")
 
 
+@pytest.mark.slow
 def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None:
     """In the second of two episodes of five steps. Its two whole rows are kept, and resuming learns from them."""
     code, _, err = call("train", *WORDS, *TINY, "horizon=5", "out=run", cwd=tmp_path, BREAKS=8)
@@ -203,6 +206,7 @@ def test_facts_that_are_given_are_not_asked_for() -> None:
         env_spec("Bounds-v0", control_low=[-1], control_high=[1], start_mean=[0])
 
 
+@pytest.mark.slow
 def test_runs_that_were_not_evaluated_have_no_curves_to_compare(learned: Path) -> None:
     with pytest.raises(RunError, match="evaluation=0"):
         seeds_picture([learned / "run"], learned / "learning.png")

@@ -361,6 +361,7 @@ def test_clipping_limits_the_update_and_keeps_its_direction():
         np.testing.assert_allclose(info.gradient_norm[0], np.linalg.norm(gradient), rtol=1e-5)  # before clipping
 
 
+@pytest.mark.slow
 def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     """What lets a progress display look in, and a killed run go on. The emitters of a run round both programs alike."""
     task = cart(horizon=4)

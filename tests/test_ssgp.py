@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy import stats
 
 from pegasus_jax.pilco import gp as exact
@@ -93,6 +94,7 @@ def test_draws_are_functions_of_the_posterior():
         np.testing.assert_allclose(ahead.std[0, e], std_out[e] * noise, rtol=3e-3)
 
 
+@pytest.mark.slow
 def test_with_many_frequencies_it_is_the_gaussian_process(x64):
     """Its error falls as the square root of their number: 16 times as many make it 4 times as small."""
     data, process = experience(), exact.gp(**SHAPES)

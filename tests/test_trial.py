@@ -80,6 +80,7 @@ def test_nothing_is_traced_again_from_trial_to_trial(looped):
     assert traces[1] == traces[2] == traces[0]
 
 
+@pytest.mark.slow
 def test_a_study_of_many_seeds_as_one_program_is_the_loops_one_by_one(watched, looped):
     """`improve` is search after fit, `trial` is collect, add_episode, improve, and `run` a scan of so many trials."""
     study = unchecked(jax.jit(jax.vmap(run(watched.exp, TRIALS, EPISODES))))
@@ -302,6 +303,7 @@ def test_a_search_starts_from_the_better_of_the_old_policy_and_a_fresh_one(offse
     np.testing.assert_allclose(resumed.policy.params["aim"], old["aim"], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_random_episodes_come_before_any_learning():
     """With two random trials the first leaves model and policy as they were, and says so."""
     exp = compose(

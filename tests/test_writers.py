@@ -43,6 +43,7 @@ def unwritten(job: Job) -> RunState:
     return learned(job, job.writer)
 
 
+@pytest.mark.slow
 def test_folders_hold_what_is_learned_without_them(job: Job, unwritten: RunState, tmp_path) -> None:
     runs = {seed: tmp_path / f"seed{seed}" for seed in SEEDS}
     states = learned(job, writers.run_folders(runs, CONFIG, job.experiment.task, "", print))

@@ -117,6 +117,7 @@ def test_the_documented_table_is_that_of_the_results() -> None:
     assert table.table() in page
 
 
+@pytest.mark.slow
 def test_a_child_ends_as_its_command_does() -> None:
     assert common.forked(lambda: sys.exit(3), 10).status == 3
     assert common.forked(lambda: print("said"), 10).out == "said\n"

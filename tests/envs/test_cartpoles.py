@@ -172,7 +172,7 @@ def test_place_is_the_inverse_of_observe(system):
     np.testing.assert_allclose(system.plant.observe(system.plant.place(x)), x, atol=1e-6)
 
 
-@pytest.mark.parametrize("construct", [cartpole, double_cartpole])
+@pytest.mark.parametrize("construct", [cartpole, pytest.param(double_cartpole, marks=pytest.mark.slow)])
 def test_gradient_matches_finite_differences(construct):
     with jax.enable_x64(True):
         plant = construct()
@@ -185,6 +185,7 @@ def test_gradient_matches_finite_differences(construct):
         assert np.abs(gradient).min() > 1e-3
 
 
+@pytest.mark.slow
 def test_double_precision_agrees_with_mjx_step():
     from mujoco import mjx
 

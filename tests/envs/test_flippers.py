@@ -5,6 +5,7 @@ from functools import partial
 import jax
 import mujoco
 import numpy as np
+import pytest
 
 from pegasus_envs import physics
 from pegasus_envs.swimmer.dynamics import acceleration
@@ -56,6 +57,7 @@ def test_every_constant_counts():
             np.testing.assert_allclose(accelerate(qpos, qvel, command), exact, atol=1e-11 * np.abs(exact).max())
 
 
+@pytest.mark.slow
 def test_a_batch_equals_its_members():
     """A plant's step under `vmap`, with states, controls, or both batched, and within another `vmap`."""
     plant = swimmer("knife_edge", 6)
