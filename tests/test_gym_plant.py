@@ -49,6 +49,7 @@ def test_an_environment_not_written_for_us(env: str, cost: str, states: int, lim
     """What the run stored is what Gymnasium says: the same controls from the same start give the same observations."""
     done = train(f"env={env}", f"cost={cost}", "horizon=8", *TINY, "out=run", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert done.stderr.count("circles=[[") == 1
     rows = store.trials(tmp_path / "run")
     assert [row["random"] for row in rows] == [True, False]
     assert all(np.isfinite(row["mean_cost"]) for row in rows)
@@ -56,7 +57,9 @@ def test_an_environment_not_written_for_us(env: str, cost: str, states: int, lim
         ran = store.load_episode(tmp_path / "run", trial)
         assert ran is not None
         steps = len(ran.trajectory.u)  # the double pendulum falls before it is over
-        assert ran.trajectory.x.shape == (steps + 1, states)
+        with np.load(store.episode_path(tmp_path / "run", trial)) as file:
+            assert file["observation"].shape == (steps + 1, states)
+            assert ran.trajectory.x.shape == (steps + 1, states - len(file["circles"]))
         assert (steps == 8) == (ran.ended == "horizon")
         assert np.all(np.abs(ran.trajectory.u) <= limit)
     assert config_io.load(tmp_path / "run" / "config.yaml").env == env

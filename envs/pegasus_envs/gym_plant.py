@@ -28,6 +28,8 @@ class EnvSpec(NamedTuple):
     """control periods of an episode; the environment's own limit, or 100"""
     start_mean: np.ndarray
     start_std: np.ndarray
+    starts: np.ndarray
+    """observations [N, D] where episodes start, equally likely; none where start_mean and start_std say it"""
 
 
 class EnvPlant(NamedTuple):
@@ -60,7 +62,7 @@ def close_env(name: str, arguments: tuple[str, ...] = ()) -> None:
     """Close the environment if it is open; the next use opens it again."""
     env = _opened.pop((name, arguments), None)
     if env is not None:
-        starts.cache_clear()
+        resets_of.cache_clear()
         env.close()
 
 
@@ -72,7 +74,7 @@ def close_environments() -> None:
 
 
 @cache
-def starts(name: str, arguments: tuple[str, ...] = (), resets: int = RESETS) -> np.ndarray:
+def resets_of(name: str, arguments: tuple[str, ...] = (), resets: int = RESETS) -> np.ndarray:
     """Where as many resets take an environment [resets, D]."""
     env = make_env(name, arguments)
     space: Any = env.observation_space
@@ -89,8 +91,9 @@ def env_spec(
     horizon: int | None = None,
     start_mean: Sequence[float] = (),
     start_std: Sequence[float] = (),
+    starts: Sequence[Sequence[float]] = (),
 ) -> EnvSpec:
-    """What is given of an environment, and the rest from itself; without a `start_mean` it is reset 100 times.
+    """What is given of an environment, and the rest from itself; without `starts` or their mean it is reset 100 times.
 
     Raises ValueError, in one line, when its controls or observations are not vectors of numbers, or cannot be as given.
     """
@@ -112,11 +115,15 @@ def env_spec(
             )
     size, rest = seen.shape[0], np.zeros(seen.shape)
     mean, std = filled("start_mean", start_mean, size, rest, each=True), filled("start_std", start_std, size, rest)
-    if not len(start_mean):
-        places = starts(name, arguments)
+    if not len(start_mean) and not len(starts):
+        starts = [row.tolist() for row in resets_of(name, arguments)]
+    if wrong := [len(row) for row in starts if len(row) != size]:
+        raise ValueError(f"a row of starts has {wrong[0]} entries; expected {size}")
+    places = np.reshape(np.array(starts, float), (-1, size))
+    if len(places):
         mean, std = places.mean(0), places.std(0)
     limit = env.spec.max_episode_steps if env.spec else None
-    return EnvSpec(low, high, dt or period(env), horizon or limit or 100, mean, std)
+    return EnvSpec(low, high, dt or period(env), horizon or limit or 100, mean, std, places)
 
 
 def period(env: Any) -> float:

@@ -117,6 +117,14 @@ def different(name: str, values: tuple[Any, ...]) -> None:
             raise ConfigError(f"{name}=[{','.join(map(str, values))}] names {value} twice; the nearest is [{once}]")
 
 
+def pairs(name: str, values: tuple[tuple[int, ...], ...]) -> None:
+    """Raises ConfigError unless these are pairs, and no entry is there twice."""
+    for pair in values:
+        if len(pair) != 2:
+            raise ConfigError(f"{name}={shown(values)} are not pairs; for example {name}=[[0,1]]")
+    different(name, tuple(entry for pair in values for entry in pair))
+
+
 def typed(section: str, node: Any) -> None:
     """Makes each field of a config dataclass the type that it is declared as; lists become tuples.
 
@@ -157,6 +165,8 @@ def called(kind: Any) -> str:
         tuple[int, ...]: "a list of whole numbers",
         tuple[float, ...]: "a list of numbers",
         tuple[str, ...]: "a list of words",
+        tuple[tuple[int, ...], ...] | None: "a list of pairs of whole numbers or null",
+        tuple[tuple[float, ...], ...]: "a list of lists of numbers",
         str | None: "a word or null",
         int | None: "a whole number or null",
         float | None: "a number or null",

@@ -253,6 +253,9 @@ class Config:
     cost: str | None = setting(None, "module:function, observation [D] -> cost in [0, 1], in JAX", OWN)
     angles: tuple[int, ...] = setting((), "the entries of the observation that are angles [rad]", OWN)
     rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", (GYM,))
+    circles: tuple[tuple[int, ...], ...] | None = setting(
+        None, "as [[0,1]]: entries that are cosine and sine of one angle; null: found on 100 resets; []: none", (GYM,)
+    )
     horizon: int | None = setting(None, "control periods an episode; null: a gym's own limit, or 100", OWN)
     dt: float | None = setting(
         None, "control period [s]; null: a gym's own. A whole number of an mjcf's time steps", OWN
@@ -272,6 +275,9 @@ class Config:
     start_mean: tuple[float, ...] = setting((), "of the observation; []: of 100 resets, the file's pose at rest", OWN)
     start_std: tuple[float, ...] = setting(
         (0.1,), "spread of the starts around start_mean, one for all or one each", OWN
+    )
+    starts: tuple[tuple[float, ...], ...] = setting(
+        (), "observations where episodes start, equally likely; []: 100 resets, or as start_mean says", (GYM,)
     )
     success: float = setting(0.2, "the mean cost of an episode's last five steps is less than this", OWN)
     seed: int = setting(0, "all randomness of the run comes from it")
@@ -297,6 +303,9 @@ class Config:
             checks.different(name, getattr(self, name))
         for name in ("control_low", "control_high", "start_mean"):
             checks.finite(name, getattr(self, name))
+        for row in self.starts:
+            checks.finite("starts", row)
+        checks.pairs("circles", self.circles or ())
         for deviation in self.start_std:
             checks.within("start_std", deviation, 0)
         checks.within("success", self.success, 0, open_low=True)

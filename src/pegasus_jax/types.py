@@ -160,6 +160,10 @@ class Task(NamedTuple):
     # x [D] -> probability that an episode ends there; None: it ends at the horizon, or where the environment says so
     stop: Callable[[Array], Array] | None = None
     stop_cost: float = 1.0  # of each control period that an early end leaves out
+    # Pairs of entries of the user's observation that are cosine and sine of one angle of x (math/circles.py); (): the
+    # observation is x.
+    circles: tuple[tuple[int, ...], ...] = ()
+    starts: Any = None  # [N, D] states where episodes start, equally likely; None: N(start_mean, diag(start_std^2))
 
     @property
     def may_end(self) -> bool:

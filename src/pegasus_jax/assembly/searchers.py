@@ -217,6 +217,8 @@ def imagined(
 
 def start(key: Key, *, task: Task) -> Array:
     """A first state [D] of the task."""
+    if task.starts is not None:
+        return jax.random.choice(key, jnp.asarray(task.starts, float))
     mean, std = jnp.asarray(task.start_mean, float), jnp.asarray(task.start_std, float)
     return mean + std * jax.random.normal(key, mean.shape)
 

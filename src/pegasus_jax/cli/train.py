@@ -135,7 +135,7 @@ def _checked(asked: Asked, over: Any) -> Config:
     """The config with all that is known of its task. Impossible settings end here, before anything is written."""
     from pegasus_jax.assembly.experiments import build
     from pegasus_jax.runs import restore
-    from pegasus_jax.runs.check import RESETS, before_training
+    from pegasus_jax.runs.check import RESETS, before_training, circles_found
     from pegasus_jax.tasks import pinned
 
     if asked.resumed is not None:
@@ -145,7 +145,7 @@ def _checked(asked: Asked, over: Any) -> Config:
         return config
     config = pinned(asked.config)
     task = build(replace(config, seed=0), over).task
-    for note in before_training(config, task, 1 if asked.given else RESETS):
+    for note in circles_found(asked.config, config) + before_training(config, task, 1 if asked.given else RESETS):
         print(f"note: {note}", file=sys.stderr)
     return config
 

@@ -7,8 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import tasks
-from pegasus_jax.checks import ConfigError
+from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
+from pegasus_jax.math.circles import entries
 from pegasus_jax.tasks import cost_check, user_code
 from pegasus_jax.types import Task
 
@@ -33,12 +34,22 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
         high,
         np.zeros((0, len(task.state_names))),
         task.success,
+        task.circles,
     )
     notes = cost_check.notes(task.cost, facts, f"cost={config.cost}")
     stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)
-    return [*notes, *plausible(readings, facts), *alike(readings, task.angles)]
+    return [*notes, *plausible(readings, facts), *alike(readings, task.angles, task.state_names)]
+
+
+def circles_found(given: Config, known: Config) -> list[str]:
+    """The note that pairs of cosines and sines were found, where the user said nothing of them: one line, or none."""
+    if given.circles is not None or not known.circles:
+        return []
+    pairs = ", and ".join(f"x{cosine} and x{sine} are cosine and sine of one angle" for cosine, sine in known.circles)
+    found = f"circles={shown(known.circles)} found: {pairs}, which is learned instead of them"
+    return [f"{found}; cost= still gets the observation; circles=[] switches this off"]
 
 
 def stopping(config: Config, task: Task) -> None:
@@ -65,7 +76,8 @@ def plausible(readings: np.ndarray, facts: cost_check.Facts) -> list[str]:
     for entry in facts.angles:
         seen = [*readings[:, entry], facts.start_mean[entry]]
         largest = float(max(seen, key=abs))
-        text = f"angles=[{entry}]: x{entry} is {largest:.4g} at the start"
+        theirs = entries(len(facts.start_mean) + len(facts.circles), facts.circles)[entry]
+        text = f"angles=[{theirs}]: x{theirs} is {largest:.4g} at the start"
         if abs(largest) > 4 * np.pi:
             raise ConfigError(f"{text}, more than two turns in radians; degrees? Return np.deg2rad of it")
         if abs(largest) > 2 * np.pi:
@@ -73,23 +85,23 @@ def plausible(readings: np.ndarray, facts: cost_check.Facts) -> list[str]:
     return notes
 
 
-def alike(readings: np.ndarray, angles: tuple[int, ...] = ()) -> list[str]:
+def alike(readings: np.ndarray, angles: tuple[int, ...] = (), names: tuple[str, ...] = ()) -> list[str]:
     """Notes on entries of readings [N, D] that never change, and on those that follow from others."""
     count, size = readings.shape
     if count < 3:
         return []
+    names = names or tuple(f"x{i}" for i in range(size))
     spread = np.ptp(readings, axis=0)
     still = spread <= 1e-6 * np.maximum(1, np.abs(readings).max(0))
     notes = []
     if still.any():
-        names = ", ".join(f"x{i}" for i in np.flatnonzero(still))
-        notes.append(f"after each of {count} resets the same: {names}; what never changes only costs time")
-    features = {f"x{i}": readings[:, i] for i in range(size) if not still[i]}
+        same = ", ".join(names[i] for i in np.flatnonzero(still))
+        notes.append(f"after each of {count} resets the same: {same}; what never changes only costs time")
     for i in range(size):
-        earlier = {name: value for name, value in features.items() if int(name[1:]) < i}
-        earlier |= {f"{f.__name__}(x{a})": f(readings[:, a]) for a in angles if a != i for f in (np.sin, np.cos)}
-        if not still[i] and (names := _explained(readings[:, i], earlier)):
-            notes.append(f"x{i} follows from {names} in all of {count} resets; one of them is enough")
+        earlier = {names[j]: readings[:, j] for j in range(i) if not still[j]}
+        earlier |= {f"{f.__name__}({names[a]})": f(readings[:, a]) for a in angles if a != i for f in (np.sin, np.cos)}
+        if not still[i] and (others := _explained(readings[:, i], earlier)):
+            notes.append(f"{names[i]} follows from {others} in all of {count} resets; one of them is enough")
     return notes
 
 
@@ -113,9 +125,9 @@ def report(config: Config) -> list[str]:
 
     given = bool(config.start_mean)
     set_precision(config)
-    config = tasks.pinned(config)
+    asked, config = config, tasks.pinned(config)
     task = build(replace(config, seed=0)).task
-    notes = before_training(config, task, 1 if given else RESETS)
+    notes = circles_found(asked, config) + before_training(config, task, 1 if given else RESETS)
     start = jnp.asarray(task.start_mean, float)
     facts: dict[str, Any] = {
         "task": " ".join([config.task, *([task.name] if task.name != config.task else [])]),

@@ -9,6 +9,7 @@ import numpy as np
 from pegasus_jax import episode, interrupt
 from pegasus_jax.checks import RunError
 from pegasus_jax.experiment import COLLECT, trial_key
+from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs.job import Job
 from pegasus_jax.runs.programs import fetched, leads
 from pegasus_jax.tasks import user_code
@@ -79,7 +80,9 @@ def costed(job: Job, ran: Episode, trial: int) -> Episode:
     x = np.asarray(ran.trajectory.x)
     cost = np.asarray(jax.vmap(job.experiment.task.cost)(jnp.asarray(x[1:])))
     for (t,) in np.argwhere(~np.isfinite(cost))[:1]:
-        found = f"the cost of the observation {x[t + 1].tolist()} is {cost[t]}"
+        found = (
+            f"the cost of the observation {to_observation(x[t + 1], job.experiment.task.circles).tolist()} is {cost[t]}"
+        )
         job.writer.problem(f"trial {trial}: {found}; mend the cost")
     return ran._replace(trajectory=ran.trajectory._replace(cost=cost))
 

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pegasus_jax.math.circles import to_state
 from pegasus_jax.runs import restore
 
 
 class Controller:
-    """A learned policy: call it with an observation x [D] for the control u [U], within the task's limits.
+    """A learned policy: call it with the user's observation x [O] for the control u [U], within the task's limits.
 
     `trial` is the trial after which it was learned. `reset` is to be called before each episode. Nothing global of JAX
     is changed, by making it or by calling it.
@@ -22,15 +23,16 @@ class Controller:
     def __init__(self, run: Path, trial: restore.Trial) -> None:
         config, experiment, state = restore.restored(run, trial)
         self.trial = int(state.trial)
-        self._params, self._size = state.policy.params, len(experiment.task.state_names)
+        circles = experiment.task.circles
+        self._params, self._size = state.policy.params, len(experiment.task.state_names) + len(circles)
         double = config.precision == "double"
         self._type, self._width = (np.float64, partial(jax.enable_x64, True)) if double else (np.float32, nullcontext)
         with restore.precision(config):
-            act = jax.jit(lambda params, x: experiment.policy.apply(params, None, x))
+            act = jax.jit(lambda params, x: experiment.policy.apply(params, None, to_state(x, circles)))
             self._act = act.lower(self._params, jnp.zeros(self._size, self._type)).compile()
 
     def __call__(self, x: ArrayLike) -> np.ndarray:
-        """The control u [U] for an observation x [D]. Raises ValueError unless that is D finite numbers."""
+        """The control u [U] for an observation x [O]. Raises ValueError unless that is O finite numbers."""
         x = np.asarray(x, self._type)
         if x.shape != (self._size,) or not np.isfinite(x).all():
             raise ValueError(f"an observation is {self._size} finite numbers, not {x}")

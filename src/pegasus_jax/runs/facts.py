@@ -34,6 +34,7 @@ def of_task(task: Task) -> dict[str, Any]:
         **{name: [int(entry) for entry in getattr(task, name)] for name in ENTRIES},
         **{name: np.asarray(getattr(task, name), float).tolist() for name in (*STATE, *CONTROL)},
         **{name: float(getattr(task, name)) for name in NUMBERS},
+        **({"circles": [list(pair) for pair in task.circles]} if task.circles else {}),
         **({} if digest is None else {"mjcf_digest": digest}),
     }
 
@@ -50,6 +51,7 @@ def to_task(found: Any, where: str) -> Task:
             **{name: _numbers(found[name], states) for name in STATE},
             **{name: _numbers(found[name], controls) for name in CONTROL},
             **{name: float(_numbers([found[name]], 1)[0]) for name in NUMBERS},
+            "circles": tuple(_pair(pair, states + len(found["circles"])) for pair in found.get("circles", ())),
         }
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{where} is damaged: its task has no usable {str(error) or 'facts'}") from error
@@ -96,6 +98,12 @@ def _whole(value: Any, low: int, high: int) -> int:
     if type(value) is not int or not low <= value <= high:
         raise TypeError("whole numbers")
     return value
+
+
+def _pair(value: Any, observed: int) -> tuple[int, ...]:
+    if len(value) != 2:
+        raise TypeError("circles")
+    return tuple(_whole(entry, 0, observed - 1) for entry in value)
 
 
 def _numbers(values: Any, count: int) -> np.ndarray:

@@ -3,7 +3,8 @@
     RUN/config.yaml          every setting
         run.json             versions, machine, commands, and the facts of the task (facts.py)
         episodes/0001.npz    of L <= H control periods: x [L+1, D], u [L, U], cost [L], how it ended, the policy that
-                             ran, names, dt; written before anything else happens to it
+                             ran, names, dt; written before anything else happens to it. Where x has angles for
+                             the cosines and sines that its user observes, also observation [L+1, O] and circles
         imagined/0001.npz    particles after trial 1: x [H+1, K, D], u [H, K, U], cost [H, K]
         trials.jsonl         one JSON object a trial
         checkpoints/0001/    the state after trial 1, with 0001.json: the SHA-256 of each of its files
@@ -25,6 +26,7 @@ import numpy as np
 from filelock import FileLock, Timeout
 
 from pegasus_jax.checks import ConfigError, RunError
+from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs import facts
 from pegasus_jax.runs.files import strict, write_json, write_whole
 from pegasus_jax.runs.machine import about
@@ -145,6 +147,8 @@ def save_episode(run: Path, trial: int, episode: Trajectory, task: Task, *, poli
         x=np.asarray(episode.x)[: length + 1], u=np.asarray(episode.u)[:length], cost=np.asarray(episode.cost)[:length]
     )
     known = dict(state_names=task.state_names, control_names=task.control_names, dt=task.dt, horizon=task.horizon)
+    if task.circles:  # x has angles for some of its cosines and sines
+        known |= dict(observation=to_observation(arrays["x"], task.circles), circles=task.circles)
     known |= dict(task=task_of(run).name, trial=trial, policy=policy, ended=ended)
     write_whole(episode_path(run, trial), lambda file: np.savez(file, **arrays, **known))  # type: ignore[arg-type]
 

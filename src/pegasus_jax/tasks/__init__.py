@@ -14,7 +14,8 @@ from pegasus_jax import interrupt
 from pegasus_jax.checks import ConfigError, nearest
 from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
 from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
-from pegasus_jax.tasks import user_code
+from pegasus_jax.math import circles
+from pegasus_jax.tasks import circled, user_code
 from pegasus_jax.types import Task
 
 if TYPE_CHECKING:
@@ -136,9 +137,11 @@ def pinned(config: Config) -> Config:
             raise
         except BaseException as error:
             raise ConfigError(f"env={config.env}: {user_code.told(error)}") from error
-        plain = {
+        plain: dict[str, Any] = {
             name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known._asdict().items()
         }
+        if config.circles is None:
+            plain["circles"] = circles.find(known.starts, (*config.angles, *config.rates))
         return dataclasses.replace(config, **plain)
     if config.task != MJCF or config.mjcf is None:
         return config
@@ -151,17 +154,19 @@ def of_gym(config: Config) -> Task:
 
     _complete(config)
     known: dict[str, Any] = {name: getattr(config, name) for name in EnvSpec._fields}
-    if any(value in (None, ()) for value in known.values()):
+    if any(value in (None, ()) for name, value in known.items() if name != "starts"):
         return of_gym(pinned(config))
     known |= {name: np.array(value, float) for name, value in known.items() if isinstance(value, tuple)}
     name, about = config.env or "", EnvSpec(**known)
     states = tuple(f"x{i}" for i in range(len(about.start_mean)))
     controls = tuple(f"u{i}" for i in range(len(about.control_low)))
     task = _of_users(config, name, None, about, about.horizon, states, controls)
-    return task._replace(
+    task = task._replace(
         rates=_entries("rates", config.rates, name, len(states)),
         environment=env_plant(name, config.env_args, len(states)),
+        starts=about.starts if len(about.starts) else None,
     )
+    return circled.start_moments(circled.of_angles(task, config.circles or ()))
 
 
 def close_environments() -> None:
@@ -189,24 +194,27 @@ def _complete(config: Config) -> None:
 
 
 def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarray]:
-    """The least and the greatest observation [D] as far as its environment tells them, else infinite."""
+    """The least and the greatest state [D] as far as its environment tells them, else infinite."""
     if config.task == GYM:
         space: Any = environment(config).observation_space
-        return np.asarray(space.low, float), np.asarray(space.high, float)
+        low, high = (circles.to_state(np.array(limit, float), task.circles) for limit in (space.low, space.high))
+        turning = [*circles.angle_places(space.shape[0], task.circles)]
+        low[turning], high[turning] = -np.inf, np.inf
+        return low, high
     return np.full(len(task.state_names), -np.inf), np.full(len(task.state_names), np.inf)
 
 
 def readings(config: Config, task: Task, resets: int) -> np.ndarray:
-    """What an environment observes after so many resets [N, D]; N is 0 for a simulation of our own.
+    """The states of an environment after so many resets [N, D]; N is 0 for a simulation of our own.
 
     Raises ConfigError, in one line, for what the environment raises.
     """
     if config.task != GYM:
         return np.zeros((0, len(task.state_names)))
-    from pegasus_envs.gym_plant import starts
+    from pegasus_envs.gym_plant import resets_of
 
     with user_code.blamed(f"env={config.env} cannot be reset"):
-        return starts(config.env or "", config.env_args, resets)
+        return circles.to_state(resets_of(config.env or "", config.env_args, resets), task.circles)
 
 
 def compared(config: Config, task: Task) -> None:

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.math.circles import Circles, to_observation
 from pegasus_jax.tasks.user_code import blamed, definition, line_of, place_of
 
 UNBOUNDED = 1e6  # limits of an observation beyond this are none
@@ -16,15 +17,16 @@ NEAR = 1e-3  # of an entry's scale: as near to a point as tells whether the cost
 
 
 class Facts(NamedTuple):
-    """What is known of a task's observation x [D] when its cost is checked."""
+    """What is known of a task's state [D] when its cost is checked."""
 
     start_mean: np.ndarray  # [D]
     start_std: np.ndarray  # [D]
     angles: tuple[int, ...]
     low: np.ndarray  # [D] least values, -inf where not known
     high: np.ndarray  # [D]
-    seen: np.ndarray  # [N, D] observations, maybe none
+    seen: np.ndarray  # [N, D] states, maybe none
     success: float = 0.2
+    circles: Circles = ()  # of the observation that the user's cost gets
 
 
 def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
@@ -32,13 +34,13 @@ def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
 
     It is traced once, and evaluated with its gradient at the start, at zero and at 100 points around them.
     """
-    _traced(cost, len(facts.start_mean), what)
+    _traced(cost, len(facts.start_mean), len(facts.circles), what)
     points, values, slopes = _evaluated(cost, facts, what)
     least, most = int(np.argmin(values)), int(np.argmax(values))
     if values[least] < -1e-5 * max(1, np.abs(values).max()):
         raise ConfigError(
-            f"{what} is {values[least]:.3g}, negative, at {_text(points[least])}{_at(cost)}; is it a reward? A cost is"
-            " 0 at the goal and grows away from it, to 1"
+            f"{what} is {values[least]:.3g}, negative, at {_text(points[least], facts)}{_at(cost)}; is it a reward?"
+            " A cost is 0 at the goal and grows away from it, to 1"
         )
     if not slopes.any():
         raise ConfigError(
@@ -47,8 +49,8 @@ def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
         )
     if values[most] > 1 + 1e-3:
         return [
-            f"{what} is {values[most]:.3g} at {_text(points[most])}, more than 1: success then means an episode whose"
-            f" last five steps cost less than success={facts.success:g} on average"
+            f"{what} is {values[most]:.3g} at {_text(points[most], facts)}, more than 1: success then means an episode"
+            f" whose last five steps cost less than success={facts.success:g} on average"
         ]
     return []
 
@@ -64,12 +66,14 @@ def _evaluated(cost: Callable[[Any], Any], facts: Facts, what: str) -> tuple[np.
         if i < len(points) - AROUND and not _continuous(cost, points[i], facts, values):
             possible[i] = False  # arctan2(0, 0) of a cosine and a sine
         elif not np.isfinite(values[i]):
-            raise ConfigError(f"{what} is {values[i]:g} at {_text(points[i])}{_at(cost)}; expected a finite number")
+            raise ConfigError(
+                f"{what} is {values[i]:g} at {_text(points[i], facts)}{_at(cost)}; expected a finite number"
+            )
         else:
             slope = slopes[i][~np.isfinite(slopes[i])][0]
             raise ConfigError(
-                f"{what} has a gradient that is {slope:g} at {_text(points[i])}{_at(cost)}; a root or a norm has none"
-                " at 0, jnp.sqrt(s + 1e-6) has"
+                f"{what} has a gradient that is {slope:g} at {_text(points[i], facts)}{_at(cost)}; a root or a norm has"
+                " none at 0, jnp.sqrt(s + 1e-6) has"
             )
     return points[possible], values[possible], slopes[possible]
 
@@ -100,7 +104,7 @@ def scales(facts: Facts) -> np.ndarray:
     return np.where(known > 0, known, 1.0)
 
 
-def _traced(cost: Callable[[Any], Any], size: int, what: str) -> None:
+def _traced(cost: Callable[[Any], Any], size: int, pairs: int, what: str) -> None:
     """Raises ConfigError unless JAX can trace the cost to one number, and it reads no entry that is not there."""
 
     def one(x: Any) -> Any:
@@ -120,7 +124,8 @@ def _traced(cost: Callable[[Any], Any], size: int, what: str) -> None:
         raise
     for index, length, line in beyond(traced):
         raise ConfigError(
-            f"{what} reads entry {index} of {length}{_in(line)}, where JAX takes another; x has {size}, 0 to {size - 1}"
+            f"{what} reads entry {index} of {length}{_in(line)}, where JAX takes another; x has {size + pairs},"
+            f" 0 to {size + pairs - 1}"
         )
 
 
@@ -222,5 +227,6 @@ def _in(place: str | None) -> str:
     return f" at {place}" if place else ""
 
 
-def _text(x: np.ndarray) -> str:
+def _text(state: np.ndarray, facts: Facts) -> str:
+    x = to_observation(state, facts.circles)
     return f"x=[{', '.join(f'{v:.3g}' for v in x[:6])}{', ...' if len(x) > 6 else ''}]"
