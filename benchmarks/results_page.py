@@ -1,41 +1,57 @@
-"""docs/results.md: every figure beside what the paper says of it, generated from benchmarks/figures and the results.
+"""What the stored results show: README.md's table of results, and docs/results.md with every figure and its claims.
 
     python -m benchmarks.results_page
 
-Run it again when a study has been added: it draws the figures' pictures, and writes what is between the page's markers.
+Run it after a study was added: it draws the figures' pictures and writes what is between the markers of both pages.
 """
 
-import json
 import os
 from pathlib import Path
 
+from benchmarks import readme_table
 from benchmarks.study import RESULTS
 from pegasus_jax.studies import claims
-from pegasus_jax.studies.comparison import draw, results, stored
+from pegasus_jax.studies.comparison import draw, results
 from pegasus_jax.studies.figures import Figure, read
 
 FIGURES = Path(__file__).parent / "figures"
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
+README = Path(__file__).parents[1] / "README.md"
 ORDER = ("cartpole", "crn", "clip", "rbf", "nn", "double")
 BEGIN, END = "<!-- generated: python -m benchmarks.results_page -->\n", "<!-- generated until here -->\n"
 
 
 def main() -> None:
-    """Draw every figure that has studies, and write the page's generated part."""
+    """Draw every figure that has studies, and write the generated part of both pages."""
     for path in FIGURES.glob("*.toml"):
         figure = read(path)
         if there := results(figure, RESULTS):
             draw(figure, there, RESULTS)
-    before, _, rest = PAGE.read_text().partition(BEGIN)
-    PAGE.write_text(before + BEGIN + generated(FIGURES, RESULTS) + END + rest.partition(END)[2])
+    write(README, readme(RESULTS))
+    write(PAGE, page(FIGURES, RESULTS))
 
 
-def generated(folder: Path, out: Path) -> str:
-    """A section for each figure's file in the folder, and one for the studies in `out` that belong to none."""
+def write(path: Path, generated: str) -> None:
+    """Replace what is between the markers of a page; the rest is a person's."""
+    before, _, rest = path.read_text().partition(BEGIN)
+    path.write_text(before + BEGIN + generated + END + rest.partition(END)[2])
+
+
+def readme(out: Path) -> str:
+    """The generated part of README.md."""
+    return f"\n{readme_table.readme_table(out)}\n\n"
+
+
+def page(folder: Path, out: Path) -> str:
+    """The generated part of docs/results.md: the table by trial, then a section for each figure."""
+    return f"\n{readme_table.by_trial(out)}" + figures(folder, out)
+
+
+def figures(folder: Path, out: Path) -> str:
+    """A section for each figure's file in the folder."""
     paths = {path.stem: path for path in sorted(folder.glob("*.toml"))}
     names = [*(name for name in ORDER if name in paths), *(name for name in paths if name not in ORDER)]
-    figures = [read(paths[name]) for name in names]
-    return "".join(section(figure, out) for figure in figures) + others(figures, out)
+    return "".join(section(read(paths[name]), out) for name in names)
 
 
 def section(figure: Figure, out: Path) -> str:
@@ -50,22 +66,16 @@ def section(figure: Figure, out: Path) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def others(figures: list[Figure], out: Path) -> str:
-    """The studies in `out` of no figure, each with its command."""
-    known = {f"{figure.name}-{label}" for figure in figures for label in figure.variants}
-    stems = [path.stem for path in sorted(out.glob("*.json")) if path.stem not in known and is_study(path)]
-    found = {stem: result for stem in stems if (result := stored(out, stem)) is not None}
-    if not found:
-        return ""
-    header = ["study", *claims.HEADER[1:]]
-    commands = [f"* `{result['about']['command']}`" for result in found.values()]
-    table = claims.markdown([header, *(claims.row(stem, result) for stem, result in found.items())])
-    return "\n\n".join(["\n## Other studies", table, "\n".join(commands)]) + "\n"
-
-
-def is_study(path: Path) -> bool:
-    """Whether a result is a learning study; others are of speed."""
-    return "mean_cost" in json.loads(path.read_text())
+def shown(folder: Path, out: Path) -> set[str]:
+    """The files of `out` that a row of a table, a figure or a claim shows, by name."""
+    every = [read(path) for path in folder.glob("*.toml")]
+    stems = {stem for row in (*readme_table.ROWS, *readme_table.MORE) for stem in row.studies}
+    stems |= {f"{figure.name}-{label}" for figure in every for label in figure.variants}
+    stems |= {
+        side for figure in every for one in figure.claims for side in (one.lower, one.than) if isinstance(side, str)
+    }
+    there = {path.name for path in out.iterdir()}
+    return there & ({f"{stem}.json" for stem in stems} | {f"{figure.name}.png" for figure in every})
 
 
 if __name__ == "__main__":

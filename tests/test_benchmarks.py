@@ -1,7 +1,13 @@
-"""The benchmarks' own arithmetic: what is compared, what counts as slower, and that peers do the same work."""
+"""The benchmarks' own arithmetic: what is compared, what counts as slower, and that peers do the same work.
 
+And the stored results: a page shows each of them, and README's table says what its presets learned.
+"""
+
+import dataclasses
 import json
 import os
+import re
+import shlex
 from pathlib import Path
 
 import jax
@@ -9,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import compare, scaling, searches, timing
+from benchmarks import compare, readme_table, results_page, scaling, searches, timing
+from benchmarks.study import RESULTS
 from benchmarks.workloads import SIZES, flop, products, workload
 from pegasus_jax.runs import config_io, machine
 from probes import unchecked
@@ -191,3 +198,59 @@ def test_searches_from_fresh_policies_are_judged_side_by_side(tmp_path, capsys, 
     assert 0.9 < np.min(costs["as it is"]) <= 1, "two iterations swing nothing up"
     assert costs["search.widen=4"] == [[0.3, 0.5, 0.9]] * 4
     assert "mean 0.567  median 0.500  below .35 33%, .6 67%  above .8 33%" in capsys.readouterr().out
+
+
+# Stored results
+
+PAGES = [results_page.README, *results_page.PAGE.parent.glob("*.md")]
+
+
+def test_a_page_shows_each_stored_file():
+    """A figure or a row of a table shows it, or a page names it with its folder."""
+    named = {name for page in PAGES for name in re.findall(r"benchmarks/results/([\w.-]+\w)", page.read_text())}
+    kept = {path.name for path in RESULTS.iterdir() if path.name != "README.md"}
+    assert named <= kept, "a page names a file that is not stored"
+    assert not kept - named - results_page.shown(results_page.FIGURES, RESULTS)
+
+
+@pytest.mark.parametrize("page", ["readme", "page"])
+def test_a_page_has_what_the_program_prints(page):
+    path = {"readme": results_page.README, "page": results_page.PAGE}[page]
+    text = path.read_text()
+    assert text.count(results_page.BEGIN) == text.count(results_page.END) == 1
+    made = {
+        "readme": lambda: results_page.readme(RESULTS),
+        "page": lambda: results_page.page(results_page.FIGURES, RESULTS),
+    }
+    assert text.split(results_page.BEGIN)[1].split(results_page.END)[0] == made[page]()
+
+
+@pytest.mark.parametrize("row", readme_table.ROWS + readme_table.MORE, ids=lambda row: row.studies[0])
+def test_a_row_is_its_preset_with_the_settings_that_the_row_says(row):
+    """By the command line's parser: preset= and the changed words are the config that was measured."""
+    for stem in row.studies:
+        result = json.loads((RESULTS / f"{stem}.json").read_text())
+        words = shlex.split(f"preset={row.preset} {readme_table.changes(row, result)}")
+        label, made = config_io.parse(config_io.split(words)[1]), config_io.stored_config(result["config"])
+        free = {name: getattr(made, name) for name in readme_table.FREE}
+        assert made == dataclasses.replace(label, **free)
+
+
+def test_readme_reports_what_the_first_commands_learn_with():
+    """The rows whose preset was measured as it is; a new one is welcome, none may go."""
+    whole = {
+        row.preset for row in readme_table.ROWS if not readme_table.changes(row, readme_table.pooled(row, RESULTS))
+    }
+    assert whole >= {"cartpole", "cartpole_network", "double_cartpole_gpu"}
+
+
+def test_studies_of_two_configs_are_not_one_row():
+    row = readme_table.ROWS[0]._replace(studies=("cartpole-default", "cartpole-log_normal"))
+    with pytest.raises(ValueError, match="not of one config"):
+        readme_table.pooled(row, RESULTS)
+
+
+def test_a_setting_is_a_word_of_the_command_line():
+    values = {"false": False, "null": None, "1": 1.0, "0.001": 1e-3, "[1,2.5]": (1, 2.5), "sine": "sine"}
+    assert [readme_table.word(value) for value in values.values()] == list(values)
+    assert readme_table.spans([0, 1, 2, 5, 9, 10]) == "0-2, 5, 9-10"

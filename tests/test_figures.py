@@ -201,12 +201,12 @@ def test_the_cores_of_a_processor_share_the_seeds_of_a_study(tmp_path):
 # What comes out
 
 
-def test_a_study_of_the_records_can_be_read():
-    for path in RESULTS.glob("*.json"):
-        if results_page.is_study(path):
-            result = comparison.stored(RESULTS, path.stem)
-            assert result is not None
-            assert claims.row(path.stem, result)[1] == str(len(result["seeds"]))
+def test_a_stored_study_can_be_read():
+    shown = results_page.shown(results_page.FIGURES, RESULTS)
+    for stem in (Path(name).stem for name in shown if name.endswith(".json")):
+        result = comparison.stored(RESULTS, stem)
+        assert result is not None
+        assert claims.row(stem, result)[1] == str(len(result["seeds"]))
 
 
 @pytest.mark.parametrize("picture", ["curves", "area"])
@@ -276,38 +276,28 @@ def test_when_seeds_were_solved():
 def test_the_page_tells_what_was_run_from_what_was_not(tmp_path):
     (tmp_path / "mine.toml").write_text(TINY)
     write_study(tmp_path, "mine-loose", np.random.default_rng(0).uniform(size=(5, 2)))
-    write_study(tmp_path, "other-one", np.full((2, 3), 0.4))
-    (tmp_path / "speed.json").write_text("{}")
-    page = results_page.generated(tmp_path, tmp_path)
+    page = results_page.figures(tmp_path, tmp_path)
     assert re.search(r"\| loose +\| 5 +\| 2 ", page)
     assert re.search(r"\| tight +\| not run yet ", page)
-    assert re.search(r"\| other-one +\| 2 +\| 3 ", page)
-    assert "* `made other-one`" in page
-    assert "speed" not in page
     for table in re.findall(r"(?:^\|.*\n)+", page, re.MULTILINE):
         assert len({line.count("|") for line in table.splitlines()}) == 1
 
 
-def test_refreshing_the_page_keeps_what_a_person_wrote(tmp_path, monkeypatch):
-    (tmp_path / "mine.toml").write_text(TINY)
-    write_study(tmp_path, "mine-loose", np.random.default_rng(0).uniform(size=(5, 2)))
+def test_refreshing_a_page_keeps_what_a_person_wrote(tmp_path):
     page = tmp_path / "results.md"
     page.write_text(f"before\n{results_page.BEGIN}old{results_page.END}after\n")
-    for name, value in dict(FIGURES=tmp_path, RESULTS=tmp_path, PAGE=page).items():
-        monkeypatch.setattr(results_page, name, value)
-    results_page.main()
-    once = page.read_text()
-    assert once.startswith("before\n")
-    assert once.endswith("after\n")
-    assert "\nold" not in once
-    assert "](mine.png)" in once  # drawn, and shown
-    results_page.main()
-    assert page.read_text() == once
+    for _ in range(2):
+        results_page.write(page, "new\n")
+        assert page.read_text() == f"before\n{results_page.BEGIN}new\n{results_page.END}after\n"
 
 
-def test_the_published_page_has_its_markers():
-    text = results_page.PAGE.read_text()
-    assert text.count(results_page.BEGIN) == text.count(results_page.END) == 1
+def test_a_figure_that_was_drawn_is_shown(tmp_path, monkeypatch):
+    figure = figure_of(tmp_path, TINY)
+    write_study(tmp_path, "mine-loose", np.random.default_rng(0).uniform(size=(5, 2)))
+    monkeypatch.setattr(results_page, "PAGE", tmp_path / "results.md")
+    assert "![" not in results_page.section(figure, tmp_path)
+    comparison.draw(figure, comparison.results(figure, tmp_path), tmp_path)
+    assert "](mine.png)" in results_page.section(figure, tmp_path)
 
 
 def test_unknown_numbers_are_null_and_seeds_are_lists_or_ranges():

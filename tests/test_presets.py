@@ -1,8 +1,6 @@
-"""The presets are what the command line runs and what README reports; each setting is one that something needs."""
+"""The presets are what the command line runs; each setting is one that something needs."""
 
-import dataclasses
 import itertools
-import json
 import re
 import shlex
 import tomllib
@@ -17,22 +15,6 @@ from pegasus_jax.presets import ALGORITHMS, MODELS, NETWORKS, POLICIES, PRESETS,
 from pegasus_jax.runs import config_io
 
 ROOT = Path(__file__).resolve().parents[1]
-# README's rows by their settings: the stored studies that the row counts.
-MEASURED = ROOT / "benchmarks" / "results"
-ROWS = {
-    "preset=cartpole": ["cartpole-default", "cartpole-anew", "cartpole-unseen"],
-    "preset=cartpole_network": ["cartpole-log_normal"],
-    "preset=cartpole_network search.widen=1": ["cartpole-own_cost-nodes", "cartpole-own_cost-nodes-50"],
-    "preset=double_cartpole_gpu": ["double_cartpole-reheated"],
-    "preset=double_cartpole search.steps=604 search.reheat=0 search.loosen=1": ["double_cartpole-integrated"],
-    "preset=swimmer_knife_edge": ["swimmer_knife_edge-16", "swimmer_knife_edge-16-10", "swimmer_knife_edge-16-20"],
-    "preset=swimmer_belly_up": ["swimmer-belly_up"],
-    "preset=swimmer_corkscrew": ["swimmer-corkscrew"],
-    "preset=swimmer_depth_change": ["swimmer-depth_change"],
-    "preset=swimmer_knife_edge_six_legs": ["swimmer_knife_edge-six_legs", "swimmer_knife_edge-six_legs-10"],
-}
-# The swimmer's rows were measured with other settings than those of its presets; README says so under its table.
-SWIMMER = "explore.trials=2 search.learning_rate=1e-3 search.particles=200"
 
 
 def parse(text):
@@ -117,34 +99,6 @@ def test_words_that_contradict_a_preset_end_in_one_line(text, part):
 def test_an_unknown_word_in_python_is_named():
     with pytest.raises(ConfigError, match=r"model=lognormal is unknown; did you mean 'log_normal'"):
         preset("cartpole", model="lognormal")
-
-
-# README's table
-
-
-def rows():
-    """README's labels: the words of each row, as `key=value` and nothing else, and the row's text."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    table = text.split("| settings |", 1)[1].split("\n\n", 1)[0].splitlines()[2:]
-    return {words: row for row in table for words in re.findall(r"`(preset=[^`]*)`", row)}, text
-
-
-def test_readme_reports_the_studies_that_are_compared_here():
-    found, text = rows()
-    assert {*found} == {*ROWS}
-    assert f"`{SWIMMER}`" in text
-    marked = {words for words, row in found.items() if "\\*" in row}
-    assert marked == {words for words in ROWS if "swimmer" in words}, "the note is for the swimmer's rows"
-
-
-@pytest.mark.parametrize("words", ROWS)
-def test_a_row_of_readme_was_measured_with_the_settings_of_its_label(words):
-    label = parse(f"{words} {SWIMMER}" if "swimmer" in words else words)
-    for stem in ROWS[words]:
-        stored = json.loads((MEASURED / f"{stem}.json").read_text())["config"]
-        made = config_io.stored_config(stored)
-        free = dict(seed=made.seed, trials=made.trials, evaluation=made.evaluation)
-        assert config_io.leaves(made) == config_io.leaves(dataclasses.replace(label, **free)), stem
 
 
 # Every setting has something that needs it

@@ -1,0 +1,121 @@
+"""The tables of what each preset learns: README.md's, and that of docs/results.md by trial. Both are generated.
+
+A row is a preset and the stored studies that measured it. The settings in which these studies differ from the preset
+are computed from the stored configs, so that a row cannot claim a preset that nobody measured.
+"""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks import own_cost, study
+from pegasus_jax.presets import PRESETS
+from pegasus_jax.runs import config_io
+from pegasus_jax.studies import claims
+from pegasus_jax.studies.comparison import Result
+from pegasus_jax.studies.comparison import stored as read
+from pegasus_jax.studies.study import SOLVED
+
+README_HEADER = ["task", "preset", "changed settings", "trial", "trials", "seeds"]
+README_HEADER += ["first trial at 90 %", "at 90 % in the last", "cost in the last"]
+TRIALS = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 16, 20, 24, 40)
+FREE = ("seed", "trials", "evaluation")  # a preset's results hold for any of these
+
+
+class Row(NamedTuple):
+    """A preset with the studies that measured it: stems of files in benchmarks/results with the same config."""
+
+    task: str  # what a reader calls it
+    preset: str
+    studies: tuple[str, ...]
+    module: Any = study  # the program that runs such a study
+
+
+ROWS = (
+    Row("cart-pole", "cartpole", ("cartpole-default", "cartpole-default-70", "cartpole-default-120")),
+    Row("cart-pole, the paper's network", "cartpole_network", ("cartpole-log_normal",)),
+    Row(
+        "cart-pole as your own plant: any cost, network",
+        "cartpole_network",
+        ("cartpole-own_cost-nodes", "cartpole-own_cost-nodes-50"),
+        own_cost,
+    ),
+    Row("double cart-pole, on a GPU", "double_cartpole_gpu", ("double_cartpole-reheated",)),
+    Row("double cart-pole, on a CPU", "double_cartpole", ("double_cartpole-integrated",)),
+    Row(
+        "swimmer, knife edge",
+        "swimmer_knife_edge",
+        ("swimmer_knife_edge-16", "swimmer_knife_edge-16-10", "swimmer_knife_edge-16-20"),
+    ),
+    Row("swimmer, belly up", "swimmer_belly_up", ("swimmer-belly_up",)),
+    Row("swimmer, corkscrew", "swimmer_corkscrew", ("swimmer-corkscrew",)),
+    Row("swimmer, depth change", "swimmer_depth_change", ("swimmer-depth_change",)),
+    Row(
+        "swimmer, knife edge, six legs",
+        "swimmer_knife_edge_six_legs",
+        ("swimmer_knife_edge-six_legs", "swimmer_knife_edge-six_legs-10"),
+    ),
+)
+MORE = (Row("cart-pole, four policies, on a GPU", "cartpole", ("cartpole-four_policies",)),)
+
+
+def pooled(row: Row, out: Path) -> Result:
+    """The studies of a row as one, over all their seeds. Raises ValueError where their configs differ."""
+    parts = [found for stem in row.studies if (found := read(out, stem)) is not None]
+    if len(parts) < len(row.studies) or any(changes(row, one) != changes(row, parts[0]) for one in parts):
+        raise ValueError(f"the studies {', '.join(row.studies)} are not of one config, or one is missing")
+    together = ("seeds", "mean_cost", "success_rate")
+    return parts[0] | {name: [value for part in parts for value in part[name]] for name in together}
+
+
+def changes(row: Row, result: Result) -> str:
+    """The words that make the stored config of the row's preset; "" where it is the preset."""
+    own = config_io.leaves(PRESETS[row.preset])
+    made = config_io.leaves(config_io.stored_config(result["config"]))
+    return " ".join(f"{key}={word(made[key])}" for key in made if key not in FREE and made[key] != own.get(key))
+
+
+def word(value: Any) -> str:
+    """A setting's value as a word of the command line."""
+    if isinstance(value, tuple):
+        return f"[{','.join(map(word, value))}]"
+    if value is None or isinstance(value, bool):
+        return {True: "true", False: "false", None: "null"}[value]
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def spans(seeds: list[int]) -> str:
+    """Seeds as ranges: 0-9, 15, 20-29."""
+    cuts = [i for i, (a, b) in enumerate(pairwise(seeds), 1) if b != a + 1]
+    ends = [(seeds[a], seeds[b - 1]) for a, b in pairwise([0, *cuts, len(seeds)])]
+    return ", ".join(f"{first}-{last}" if last > first else f"{first}" for first, last in ends)
+
+
+def readme_table(out: Path) -> str:
+    """README.md's table of results, from the studies in `out`."""
+    return claims.markdown([README_HEADER, *(readme_row(row, pooled(row, out)) for row in ROWS)])
+
+
+def readme_row(row: Row, result: Result) -> list[str]:
+    """One preset: how its seeds learned."""
+    _, _, trials, last, _, solved, first = claims.row("", result)
+    changed = changes(row, result)
+    seconds = f"{result['plant_seconds'][0]:g} s"
+    labels = [row.task, f"`{row.preset}`", f"`{changed}`" if changed else "none", seconds, trials]
+    return [*labels, spans(result["seeds"]), first, solved, last]
+
+
+def by_trial(out: Path) -> str:
+    """How many seeds of each row have been at 90 % by a trial, and the commands that run these studies again."""
+    lines, commands = [["task", "seeds", *map(str, TRIALS)]], []
+    for row in (*ROWS, *MORE):
+        result = pooled(row, out)
+        solved = np.maximum.accumulate(np.asarray(result["success_rate"]) >= SOLVED, axis=1).sum(0)
+        counts = [str(solved[t - 1]) if t <= len(solved) else "" for t in TRIALS]
+        lines.append([row.task, str(len(result["seeds"])), *counts])
+        words = f"preset={row.preset} {changes(row, result)}".strip()
+        name = f"python -m {row.module.__name__} NAME seeds=SEEDS trials={len(solved)} {words}"
+        commands.append(f"* {row.task}, seeds {spans(result['seeds'])}: `{name}`")
+    return claims.markdown(lines) + "\n\n" + "\n".join(commands) + "\n"
