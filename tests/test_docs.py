@@ -1,5 +1,7 @@
 """What is documented runs as it stands: every fenced program, file and command of README.md and docs/, page by page.
 
+And pages keep to their form: links that lead somewhere, decisions with four headings, the field's words.
+
 A page has a folder of its own, into which the files that the pages name are written, and in which its commands are run
 by a shell, in order. Settings are cut down by PEGASUS_SETTINGS, which is documented, and by nothing else.
 """
@@ -23,6 +25,7 @@ from pegasus_jax.runs.config_io import parse, split
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+CODE = [path for top in ("src", "envs", "tests", "benchmarks") for path in sorted((ROOT / top).rglob("*.py"))]
 
 
 class Block(NamedTuple):
@@ -199,3 +202,87 @@ def test_every_block_is_a_program_a_file_or_commands() -> None:
                 assert shlex.split(command)[0].startswith(("pegasus-", "make", "python")), command
     assert {block.file for block in FILES} == {"mymodule.py", "arm.xml", "robot.py", "drive.py"}
     assert len(PROGRAMS) >= 4
+
+
+# The form of the pages
+
+
+def links(page: Path) -> list[str]:
+    """Where the relative links of a page lead, without the part of a page after #."""
+    found = re.findall(r"\]\(([^)\s]+)\)", page.read_text())
+    return [link.partition("#")[0] for link in found if not link.startswith(("http", "#"))]
+
+
+@pytest.mark.parametrize("page", [*PAGES, ROOT / "CONTRIBUTING.md"], ids=lambda page: page.stem)
+def test_links_lead_to_files(page: Path) -> None:
+    assert [link for link in links(page) if not (page.parent / link).exists()] == []
+
+
+DECISIONS = sorted((ROOT / "docs" / "decisions").glob("0*.md"))
+INDEX = ROOT / "docs" / "decisions" / "README.md"
+
+
+@pytest.mark.parametrize("page", DECISIONS, ids=lambda page: page.stem[:4])
+def test_a_decision_is_short_and_has_its_headings(page: Path) -> None:
+    text = page.read_text()
+    assert re.findall(r"^## (.*)$", text, re.MULTILINE) == ["Context", "Decision", "Consequence", "Status"]
+    assert text.startswith(f"# {page.stem[:4]}: ")
+    assert re.search(r"^## Status\n\n(Accepted|Superseded by)\b", text, re.MULTILINE)
+    assert len(text.split()) <= 300
+
+
+def test_the_index_lists_each_decision_with_its_status() -> None:
+    rows = dict(
+        re.findall(r"^\| \[?(\d{4})\S* \| .* \| (accepted|superseded by .*) \|$", INDEX.read_text(), re.MULTILINE)
+    )
+    there = {page.stem[:4]: re.search(r"## Status\n\n(\w+)", page.read_text()) for page in DECISIONS}
+    assert {*there} == {number for number, status in rows.items() if number in there}
+    for number, status in rows.items():
+        found = there.get(number)
+        assert status.startswith(found[1].lower() if found else "superseded by"), number
+
+
+def test_decisions_that_are_cited_exist() -> None:
+    """By their numbers, from code, figures and pages; one that was superseded whole is in the index alone."""
+    cited = {
+        number
+        for path in [*CODE, *PAGES, *(ROOT / "benchmarks").rglob("*.toml")]
+        if path != Path(__file__)
+        for line in path.read_text().splitlines()
+        if re.search(r"decisions?\b", line)
+        for number in re.findall(r"\b00\d\d\b", line)
+    }
+    assert len(cited) > 15
+    assert cited <= {page.stem[:4] for page in DECISIONS} | {"0005"}
+
+
+def prose(page: Path) -> str:
+    """A page without code, commands, links' targets and formulas."""
+    text = re.sub(r"^```.*?^```$", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    return re.sub(r"`[^`]*`|\]\([^)]*\)|\$[^$]*\$", " ", text)
+
+
+# Words of our own for which the field has others.
+PRIVATE = r"anew|stale|rivals?|courses?|abreast|shelf|guests?|troubles?|processors?"
+
+
+@pytest.mark.parametrize(
+    "page", [*PAGES, INDEX.parents[2] / "benchmarks" / "results" / "README.md"], ids=lambda page: page.stem
+)
+def test_pages_use_the_fields_words(page: Path) -> None:
+    text = f"{page.stem} {prose(page)}".replace("course work", "")
+    assert re.findall(rf"(?i)\b(?:{PRIVATE})\b", text.replace("-", " ")) == []
+
+
+# The reading order of docs/design.md: | `file` | lines | what it explains |
+ORDER = re.findall(r"^\| `(\S+\.py)` \| (\d+) \|", (ROOT / "docs" / "design.md").read_text(), re.MULTILINE)
+LONG = {"types.py", "learn/search.py"}  # still more than 200 lines, which design.md says; nothing may join them
+
+
+def test_the_method_can_be_read_in_an_hour() -> None:
+    lines = {name: len((ROOT / "src" / "pegasus_jax" / name).read_text().splitlines()) for name, _ in ORDER}
+    assert ORDER[0][0] == "types.py"
+    assert ORDER[-1][0] == "learn/search.py"
+    assert sum(lines.values()) <= 1200
+    assert {name for name, count in lines.items() if count > 200} <= LONG
+    assert {name: lines[name] for name, said in ORDER if abs(lines[name] - int(said)) > 10} == {}
