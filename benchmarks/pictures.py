@@ -1,13 +1,12 @@
-"""The pictures of the documentation, drawn from a run and from the stored results.
+"""The pictures of the documentation: every plant, and an episode of a run.
 
     python -m benchmarks.pictures [run=runs/cartpole-seed0]
     python -m benchmarks.pictures plants
 
 Writes docs/pictures/cartpoles.png and swimmer.png: every plant, at its start and at its goal. With a run also
-swingup.png (a learned episode, frame by frame), and the learning curve of benchmarks/results/cartpole.png beside it.
+swingup.png: a learned episode, frame by frame. The curves of benchmarks/results are drawn by benchmarks.results_page.
 """
 
-import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks.study import RESULTS
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.plant import Plant
@@ -100,7 +98,6 @@ def main(words: list[str]) -> None:
         return
     options, _ = config_io.split(words, ("run",))
     swing_up(Path(options.get("run", "runs/cartpole-seed0")), PICTURES / "swingup.png")
-    shutil.copy(RESULTS / "cartpole.png", PICTURES / "cartpole.png")
 
 
 if __name__ == "__main__":

@@ -218,6 +218,17 @@ def test_links_lead_to_files(page: Path) -> None:
     assert [link for link in links(page) if not (page.parent / link).exists()] == []
 
 
+def test_programs_and_files_that_pages_name_exist() -> None:
+    """`python -m benchmarks.study` and `tests/test_layers.py`, in any page."""
+    text = "\n".join(page.read_text() for page in [*PAGES, ROOT / "CONTRIBUTING.md"])
+    modules = set(re.findall(r"python -m ((?:benchmarks|tests)(?:\.\w+)+)", text))
+    assert len(modules) > 10
+    there = [[ROOT.joinpath(*name.split(".")).with_suffix(".py"), ROOT.joinpath(*name.split("."))] for name in modules]
+    assert [paths[0] for paths in there if not any(path.exists() for path in paths)] == []
+    files = set(re.findall(r"`((?:src|envs|tests|benchmarks)/[\w/]+\.\w+)`", text))
+    assert [name for name in files if "NAME" not in name and not (ROOT / name).exists()] == []
+
+
 DECISIONS = sorted((ROOT / "docs" / "decisions").glob("0*.md"))
 INDEX = ROOT / "docs" / "decisions" / "README.md"
 
