@@ -5,7 +5,7 @@
 With an empty folder for compiled programs and then with the one that the first run filled; each run is a process of its
 own, killed when the first chunk of its search is done. Writes benchmarks/results/first_step.json: the total, and what
 each part took: `compile` is how long the run waited for compiling, `before` everything up to the first part (imports,
-settings, building), `cpu` processor time of all threads. On a machine that others use too, compare that.
+settings, building), `cpu` CPU time of all threads. On a machine that others use too, compare that.
 """
 
 import json

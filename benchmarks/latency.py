@@ -25,7 +25,7 @@ from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.train import train
 
-TINY = {"fit.steps": "20", "search.steps": "20", "horizon": "200", "trials": "2", "evaluation": "5"}
+TINY = {"fit.steps": "20", "search.steps": "20", "horizon": "200", "trials": "2", "eval_episodes": "5"}
 CALLS = 2000
 gaps: list[float] = []
 
@@ -69,7 +69,7 @@ def main(words: list[str]) -> None:
     gymnasium.register("Still-v0", Still)
     _, dotted = config_io.split(words)
     fixed = {"task": "gym", "env": "Still-v0", "cost": f"{__name__}:cost", "start_mean": "[0]"}
-    config = tasks.pinned(config_io.parse({**fixed, **TINY, **dotted}))
+    config = tasks.resolve(config_io.parse({**fixed, **TINY, **dotted}))
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         train(config, run)

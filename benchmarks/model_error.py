@@ -29,7 +29,7 @@ from pegasus_jax.types import Array, Key, RunState, Task, Trajectory
 
 TESTS = 20
 MODELS = "log_normal,binary,ensemble,gp,ssgp"
-EXACT = {"gp": "double", "ssgp": "double"}  # a likelihood's last digits cancel in single precision
+EXACT = {"gp": "true", "ssgp": "true"}  # a likelihood's last digits cancel in single precision
 
 
 def random_walks(task: Task, episodes: int) -> Trajectory:
@@ -86,7 +86,7 @@ def main(words: list[str]) -> None:
     path = RESULTS / f"model_error-{rest['task']}.json"
     rows: dict[str, Any] = {}
     for model in options.get("models", MODELS).split(","):
-        rows[model] = errors(config_io.parse({"precision": EXACT.get(model, "single"), "model": model} | rest), counts)
+        rows[model] = errors(config_io.parse({"x64": EXACT.get(model, "false"), "model": model} | rest), counts)
         for count, row in rows[model].items():
             print(
                 f"{model:11s} {count:>3s} episodes  median {row['median']}  calibration {row['calibration']}",

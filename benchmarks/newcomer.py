@@ -5,7 +5,7 @@
 Starts `pegasus-train` once a seed, `jobs` at a time and each in an empty folder with an empty compilation cache, and
 stops it as soon as a trial's evaluation succeeds in at least 90 % of its episodes, or after `minutes`. Writes
 benchmarks/results/newcomer.json. Times mean something only where nothing else runs; on Linux the jobs share out the
-processors, each with its own.
+CPUs, each with its own.
 """
 
 import json

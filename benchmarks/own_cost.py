@@ -1,8 +1,8 @@
 """A learning study whose search knows the task's cost as one of a user's: neither its expectation nor its width.
 
-    python -m benchmarks.own_cost NAME seeds=0-49 task=cartpole model=log_normal trials=15 search.widen=1
+    python -m benchmarks.own_cost NAME seeds=0-49 task=cartpole model=log_normal trials=15 search.cost_width_start=1
 
-Words and file as in benchmarks.study; `search.cost=particles` follows the cost of each particle.
+Words and file as in benchmarks.study; `search.cost_estimator=particles` follows the cost of each particle.
 """
 
 import sys
@@ -16,7 +16,7 @@ POSED = tasks.of_plant
 
 def of_plant(name: str, plant: Any) -> Any:
     """The task that a plant poses to someone who knows its cost only as a function."""
-    return POSED(name, plant)._replace(expected_cost=None, widened=None)
+    return POSED(name, plant)._replace(expected_cost=None, cost_with_width=None)
 
 
 if __name__ == "__main__":

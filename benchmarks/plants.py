@@ -3,7 +3,7 @@
     python -m benchmarks.plants          (on one core: taskset -c 0 python -m benchmarks.plants)
 
 Writes benchmarks/results/plants.json (plants-one-core.json on one core) and prints it. Costs: seconds to compile, and
-to run one, 10 and 100 episodes as one program, by the clock and of processor time, beside C MuJoCo's own loop.
+to run one, 10 and 100 episodes as one program, by the clock and of CPU time, beside C MuJoCo's own loop.
 Accuracy: 20 s under random controls, 8 seeds. Energy: 10 s without friction and force.
 """
 
@@ -52,7 +52,7 @@ def starts(plant: Plant, episodes: int) -> Any:
 
 
 def timed(function: Callable[[], Any], repeats: int = 3) -> tuple[float, float]:
-    """Least seconds by the clock and of processor time."""
+    """Least seconds by the clock and of CPU time."""
     clock, processor = [], []
     for _ in range(repeats):
         began, used = time.perf_counter(), time.process_time()

@@ -21,7 +21,7 @@ from pegasus_jax.studies.study import SOLVED
 README_HEADER = ["task", "preset", "changed settings", "trial", "trials", "seeds"]
 README_HEADER += ["first trial at 90 %", "at 90 % in the last", "cost in the last"]
 TRIALS = (2, 3, 4, 5, 6, 7, 8, 10, 12, 15, 16, 20, 24, 40)
-FREE = ("seed", "trials", "evaluation")  # a preset's results hold for any of these
+FREE = ("seed", "trials", "eval_episodes")  # a preset's results hold for any of these
 
 
 class Row(NamedTuple):

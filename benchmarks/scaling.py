@@ -8,7 +8,7 @@
 and says how efficient that is, t1 / (n tn); `particles` times a search step with search.particles=100000 on so many
 devices, and says how far objective and gradient norm are from those of the first. Each prints a line as soon as it
 knows something and has then written it to OUT/scaling-PART.json (out=benchmarks/results): a machine may be taken away
-at any moment. Without a GPU, XLA_FLAGS=--xla_force_host_platform_device_count=4 makes four devices of a processor.
+at any moment. Without a GPU, XLA_FLAGS=--xla_force_host_platform_device_count=4 makes four devices of a CPU.
 """
 
 import json
@@ -36,7 +36,7 @@ from pegasus_jax.config import Config
 from pegasus_jax.experiment import EVALUATE, trial_key
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
-from pegasus_jax.runs.programs import LASTING, Jitted, compiler_options, over_seeds, placed
+from pegasus_jax.runs.programs import FAST_RUN, Jitted, compiler_options, over_seeds, shard
 from pegasus_jax.types import Array, Experiment, RunState
 
 Row = dict[str, Any]
@@ -50,7 +50,7 @@ EPISODES = 20  # of evaluation
 def spread(function: Callable[..., Any], axes: tuple[int | None, ...], seeds: int, over: Mesh | None) -> Jitted:
     """The function over seeds, and these over a mesh, as `pegasus-train seeds= mesh=` compiles it."""
     layout = {} if over is None else {"out_shardings": sharding.over_seeds(over)}
-    how = compiler_options(LASTING)
+    how = compiler_options(FAST_RUN)
     return Jitted(over_seeds(function, axes, seeds=seeds, over=over), compiler_options=how, **layout)
 
 
@@ -98,7 +98,7 @@ def study(config: Config, seeds: int, over: Mesh | None, report: Callable[[Row],
 
 def on_devices(tree: Any, over: Mesh | None) -> Any:
     """The tree [S, ...] with its seeds laid out over the mesh."""
-    return tree if over is None else placed(tree, sharding.over_seeds(over))
+    return tree if over is None else shard(tree, sharding.over_seeds(over))
 
 
 def collectives(jitted: Jitted) -> int:
@@ -108,7 +108,7 @@ def collectives(jitted: Jitted) -> int:
 
 
 def peaks(devices: int) -> list[float]:
-    """The most memory that each device has held at once in this process [GB]; of processors it is not known."""
+    """The most memory that each device has held at once in this process [GB]; of CPUs it is not known."""
     stats = [device.memory_stats() for device in jax.devices()[:devices]]
     return [round(known["peak_bytes_in_use"] / 1e9, 2) for known in stats if known and "peak_bytes_in_use" in known]
 
@@ -147,7 +147,7 @@ def of_particles(options: dict[str, str], words: dict[str, str], report: Report)
         search = spread(partial(experiment.search, steps=steps), (0, None), 1, over)
         arguments: tuple[Any, ...] = (states, jnp.int32(1))  # not 0, which would also weigh a fresh policy
         if over is not None:
-            arguments = placed(states, sharding.over_seeds(over)), placed(jnp.int32(1), sharding.shared(over))
+            arguments = shard(states, sharding.over_seeds(over)), shard(jnp.int32(1), sharding.shared(over))
         _, info = search(*arguments)
         times = []
         for _ in range(repeats):

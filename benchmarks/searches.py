@@ -5,7 +5,7 @@
 Every seed is run for the last of the trials `after`; in each of them its model is kept. Under each kept model `fresh`
 policies that know nothing are searched, once with the run's settings and once with each of the variants, which are
 parted by semicolons, and their words by spaces. Writes OUT/searches.json (out=benchmarks/results) after every variant:
-the cost of each search's policy on fresh imagined rollouts. This is for a GPU; a processor takes a minute a search.
+the cost of each search's policy on fresh imagined rollouts. This is for a GPU; a CPU takes a minute a search.
 """
 
 import json
@@ -24,7 +24,7 @@ from pegasus_jax.config import Config
 from pegasus_jax.experiment import trial
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
-from pegasus_jax.runs.programs import LASTING, compiler_options
+from pegasus_jax.runs.programs import FAST_RUN, compiler_options
 from pegasus_jax.studies.study import seed_list
 from pegasus_jax.types import Array, RunState
 
@@ -36,7 +36,7 @@ def learned(config: Config, seeds: list[int], after: list[int]) -> RunState:
     experiment = build(config)
     states = jax.jit(jax.vmap(experiment.init))(jax.vmap(jax.random.key)(jnp.asarray(seeds, jnp.uint32)))
     step = jax.jit(jax.vmap(lambda state: trial(state, experiment)[0]))
-    step = step.lower(states).compile(compiler_options=compiler_options(LASTING))
+    step = step.lower(states).compile(compiler_options=compiler_options(FAST_RUN))
     kept = []
     for count in range(1, max(after) + 1):
         states = step(states)
@@ -55,7 +55,7 @@ def searched(config: Config, states: RunState, fresh: int) -> Array:
 
     program = jax.jit(jax.vmap(jax.vmap(one, (None, 0)), (0, None)))
     indices = jnp.arange(fresh)
-    return program.lower(states, indices).compile(compiler_options=compiler_options(LASTING))(states, indices)
+    return program.lower(states, indices).compile(compiler_options=compiler_options(FAST_RUN))(states, indices)
 
 
 def main(words: list[str]) -> None:
@@ -72,7 +72,7 @@ def main(words: list[str]) -> None:
     }
     for variant in ["", *filter(None, map(str.strip, options.get("each", "").split(";")))]:
         changes = dict(word.split("=", 1) for word in variant.split())
-        changed = config_io.parse({**dotted, **changes, "search.restart": "false"})
+        changed = config_io.parse({**dotted, **changes, "search.init": "previous"})
         costs = np.asarray(searched(changed, states, int(options.get("fresh", "12"))))
         result["imagined"][variant or "as it is"] = costs.round(4).tolist()
         path.write_text(json.dumps(result) + "\n")

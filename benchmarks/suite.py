@@ -136,7 +136,7 @@ def suite(words: Words, repeats: int, quick: bool) -> dict[str, Row]:
     for name in list(SIZES)[: 1 if quick else None]:
         for match in ("true", "false"):
             suffix = "" if match == "true" else ", no matching"
-            work = workload({**SIZES[name], "search.match": match, **words})
+            work = workload({**SIZES[name], "search.moment_matching": match, **words})
             rows[f"search step, {name}{suffix}"] = search_step(work, repeats)
     if not quick:  # for its memory
         work = workload({**SIZES["six-legged swimmer"], "search.particles": "1000", **words})

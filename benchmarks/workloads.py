@@ -25,7 +25,7 @@ from pegasus_jax.runs import config_io
 from pegasus_jax.types import Array, Experiment, Params, Period, RunState, Scenarios, Task, Trajectory
 
 # Every iteration alike, as the paper's and the peers' are: what a search refines by is another program.
-ALIKE = {"search.balanced": "false", "search.refine": "0", "search.anew": "false"}
+ALIKE = {"search.standardized_noise": "false", "search.refine_fraction": "0", "search.init": "better"}
 SIZES = {
     "cart-pole": {
         "task": "cartpole",
@@ -88,7 +88,7 @@ def workload(words: dict[str, str], horizon: int | None = None) -> Workload:
     posterior = jax.jit(dynamics.posterior)(state.model.params, state.data)
     blocks = blocks_of(config.search.particles, task, dynamics, policy)
     scenarios = jax.jit(partial(draw, blocks=blocks, period=Period()))(jax.random.key(1), 0, posterior)
-    match = matching.match if config.search.match else matching.keep
+    match = matching.match if config.search.moment_matching else matching.keep
     value = partial(objective, dynamics=dynamics, policy=policy, match=match, cost=costs.of_particles(task.cost))
     return Workload(config, experiment, state, posterior, scenarios, value)
 

@@ -65,7 +65,7 @@ def cart(horizon: int = 8) -> Task:
         state_names=("x", "v"),
         control_names=("u",),
         expected_cost=cost.expected_saturating(lambda x: x, 1.0, ()),
-        widened=partial(cost.widened, lambda x: x, 1.0, ()),
+        cost_with_width=partial(cost.widened, lambda x: x, 1.0, ()),
         rates=(1,),
     )
 
@@ -102,7 +102,7 @@ def dial(horizon: int = 6) -> Task:
         state_names=("angle",),
         control_names=("turn",),
         expected_cost=cost.expected_saturating(error, 0.5, (0,)),
-        widened=partial(cost.widened, error, 0.5, (0,)),
+        cost_with_width=partial(cost.widened, error, 0.5, (0,)),
     )
 
 
@@ -122,7 +122,7 @@ def tiny(**changes: Any) -> config.Config:
     sections = {
         "model": dict(hidden=(16, 16), dropout="none", weight_decay=0.1),
         "policy": dict(hidden=(16,), dropout=0.1),
-        "fit": dict(steps=400, batch=32, learning_rate=1e-2),
+        "fit": dict(steps=400, batch_size=32, learning_rate=1e-2),
         "search": dict(steps=60, particles=12, learning_rate=2e-2),
         "explore": dict(trials=1),
     }
@@ -278,7 +278,7 @@ def network(kind: str = "log_normal", heteroscedastic: bool = True, **changes: A
         dropout=noise,
         heteroscedastic=heteroscedastic,
         weight_decay=1.0,
-        initialiser="glorot",
+        initializer="glorot",
     )
     return bnn(**{**pieces, **changes})
 
@@ -293,7 +293,7 @@ def controller(kind: dropout.Dropout | None = None, squash: str = "tanh", **chan
         hidden=(8,),
         dropout=kind or dropout.binary(0.3),
         saturate=to_limits(SQUASHES[squash], low, high),
-        initialiser="glorot",
+        initializer="glorot",
     )
     return mlp(**{**pieces, **changes})
 
@@ -316,7 +316,7 @@ def make_rig(particles: int, horizon: int, heteroscedastic: bool = True) -> Rig:
         start=lambda key: jnp.array([0.2, -0.1, 3.0]) + 0.3 * jax.random.normal(key, (3,)),
         particles=particles,
         horizon=horizon,
-        balanced=False,
+        standardized_noise=False,
     )
 
     @jax.jit  # operation by operation it would take seconds

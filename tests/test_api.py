@@ -37,7 +37,7 @@ CONFIG = pg.Config(
     trials=2,
     model=pg.config.BNN(hidden=(4,)),
     policy=pg.config.MLP(hidden=(4,)),
-    fit=pg.config.Fit(steps=3, batch=4),
+    fit=pg.config.Fit(steps=3, batch_size=4),
     search=pg.config.Search(steps=2, particles=K),
 )
 
@@ -60,14 +60,14 @@ def error(x: jax.Array) -> jax.Array:
 COST = pg.Cost(
     pg.costs.saturating(error, 1.0),
     expected=pg.costs.expected_saturating(error, 1.0, ()),
-    widen=partial(pg.costs.widened, error, 1.0, ()),
+    with_width=partial(pg.costs.widened, error, 1.0, ()),
 )
 TASK = pg.Task(
     name="cart",
     plant=Plant(),
     cost=COST.of_state,
     expected_cost=COST.expected,
-    widened=COST.widen,
+    cost_with_width=COST.with_width,
     angles=(),
     start_mean=np.zeros(D),
     start_std=np.ones(D),
@@ -94,7 +94,7 @@ def experience() -> pg.Dataset:
 
 def blocks() -> pg.Blocks:
     start = lambda key: jax.random.normal(key, (D,))  # noqa: E731
-    return pg.blocks(dynamics=DYNAMICS, policy=POLICY, start=start, particles=K, horizon=H, balanced=False)
+    return pg.blocks(dynamics=DYNAMICS, policy=POLICY, start=start, particles=K, horizon=H, standardized_noise=False)
 
 
 class Imagined(NamedTuple):
@@ -140,10 +140,10 @@ def _() -> Any:
 @example("compose")
 def _() -> Any:
     """Every piece of one's own takes the configured one's place."""
-    fitted = pg.minibatches(DYNAMICS, optax.sgd(1e-3, momentum=0.9), batch=3)
+    fitted = pg.minibatches(DYNAMICS, optax.sgd(1e-3, momentum=0.9), batch_size=3)
     still = pg.Searcher(init=lambda params: (), run=lambda key, learner, *_, **__: (learner, "searched"))
     twice = pg.Cost(lambda x: 2 * jnp.sum(x**2))
-    config = dataclasses.replace(CONFIG, search=dataclasses.replace(CONFIG.search, widen=1.0))
+    config = dataclasses.replace(CONFIG, search=dataclasses.replace(CONFIG.search, cost_width_start=1.0))
     own: dict[str, Any] = dict(dynamics=DYNAMICS, policy=POLICY, fitter=fitted, searcher=still, cost=twice)
     experiment = pg.compose(config, TASK, **own)
     state = experiment.init(key())
@@ -201,9 +201,9 @@ def _() -> Any:
     start = lambda key: jax.random.normal(key, (D,))  # noqa: E731
     policies = (
         POLICY,
-        pg.mlp(**shape, features=D, hidden=(3,), dropout=pg.dropouts.binary(0.2), initialiser="glorot"),
+        pg.mlp(**shape, features=D, hidden=(3,), dropout=pg.dropouts.binary(0.2), initializer="glorot"),
         pg.linear(**shape, features=D, saturate_moments=None),
-        pg.rbf(**shape, start=start, waves=0, units=3, saturate_moments=lambda mean, cov: None),  # type: ignore[arg-type]
+        pg.rbf(**shape, start=start, waves=0, num_centers=3, saturate_moments=lambda mean, cov: None),  # type: ignore[arg-type]
         pg.of_pair(lambda key: jax.random.normal(key, (U, D)), lambda gain, features: gain @ features, TASK),
     )
     controls = [policy.apply(policy.init(key()), policy.sample(key()), X) for policy in policies]
@@ -230,9 +230,9 @@ def _() -> Any:
 def _() -> Any:
     optimizer, params = optax.adam(1e-3), DYNAMICS.init(key())
     learner = pg.Learner(params, optimizer.init(params))
-    how: dict[str, Any] = dict(prepare=DYNAMICS.prepare, loss=DYNAMICS.loss, optimizer=optimizer, batch=4)
+    how: dict[str, Any] = dict(prepare=DYNAMICS.prepare, loss=DYNAMICS.loss, optimizer=optimizer, batch_size=4)
     by_hand = pg.fit(key(), learner, experience(), steps=3, **how)
-    fitter = pg.minibatches(DYNAMICS, optimizer, batch=4)
+    fitter = pg.minibatches(DYNAMICS, optimizer, batch_size=4)
     return by_hand, fitter.run(key(), pg.Learner(params, fitter.init(params)), experience(), 3)
 
 

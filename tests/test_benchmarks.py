@@ -101,7 +101,7 @@ def test_a_workload_is_well_conditioned(work):
 def test_every_size_can_be_asked_for(name):
     """By `sizes=A,B`, and with the tasks' settings as they now are."""
     assert "," not in name
-    assert config_io.parse(SIZES[name]).search.refine == 0
+    assert config_io.parse(SIZES[name]).search.refine_fraction == 0
 
 
 def test_two_processors_of_one_name_are_told_apart(monkeypatch):
@@ -131,7 +131,7 @@ def test_plain_torch_does_the_same_work(match, activation):
     from benchmarks.peers import plain_torch
     from benchmarks.peers.compare import disagreement, problem_of
 
-    given = workload({**TINY, "search.match": match, "model.activation": activation}, horizon=3)
+    given = workload({**TINY, "search.moment_matching": match, "model.activation": activation}, horizon=3)
     found = disagreement(given, problem_of(given), plain_torch.step)
     assert found["objective"] < 1e-5
     assert found["gradient"] < 1e-3
@@ -143,7 +143,7 @@ def test_prob_mbrl_does_the_same_work(match):
     from benchmarks.peers import of_prob_mbrl
     from benchmarks.peers.compare import layers_of, tensor
 
-    given = workload({**TINY, "search.match": match}, horizon=3)
+    given = workload({**TINY, "search.moment_matching": match}, horizon=3)
     package = of_prob_mbrl.load(Path(os.environ["PROB_MBRL"]))
     found = of_prob_mbrl.disagreement(package, given, layers_of, tensor)
     assert found["objective"] < 1e-5
@@ -157,7 +157,7 @@ def test_mc_pilco_does_the_same_work():
     from benchmarks.peers import of_mc_pilco
 
     package = of_mc_pilco.load(Path(os.environ["MC_PILCO"]))
-    words = {"task": "cartpole", **of_mc_pilco.SETTINGS, "search.particles": "20", "policy.units": "7"}
+    words = {"task": "cartpole", **of_mc_pilco.SETTINGS, "search.particles": "20", "policy.num_centers": "7"}
     given = of_mc_pilco.comparable(words, horizon=3)
     with jax.enable_x64(True):
         double = of_mc_pilco.in_double(given)
@@ -185,18 +185,18 @@ def test_searches_from_fresh_policies_are_judged_side_by_side(tmp_path, capsys, 
 
     def watched(config, states, fresh):
         """The first as it is; one that found its way, for the rest."""
-        seen.append((config.search.widen, config.search.restart, states.trial.tolist()))
+        seen.append((config.search.cost_width_start, config.search.init, states.trial.tolist()))
         return real(config, states, fresh) if len(seen) == 1 else np.full((4, fresh), [0.3, 0.5, 0.9])
 
     monkeypatch.setattr(searches, "searched", watched)
-    small = TINY | {"fit.steps": "5", "search.steps": "2", "search.refine": "0"}
-    options = ["seeds=0-1", "after=1,2", "fresh=3", "each=search.widen=4", f"out={tmp_path}"]
+    small = TINY | {"fit.steps": "5", "search.steps": "2", "search.refine_fraction": "0"}
+    options = ["seeds=0-1", "after=1,2", "fresh=3", "each=search.cost_width_start=4", f"out={tmp_path}"]
     unchecked(searches.main)([*options, *(f"{name}={value}" for name, value in small.items())])
-    assert seen == [(2.0, False, [1, 1, 2, 2]), (4.0, False, [1, 1, 2, 2])]
+    assert seen == [(2.0, "previous", [1, 1, 2, 2]), (4.0, "previous", [1, 1, 2, 2])]
     costs = json.loads((tmp_path / "searches.json").read_text())["imagined"]
     assert np.shape(costs["as it is"]) == (4, 3)
     assert 0.9 < np.min(costs["as it is"]) <= 1, "two iterations swing nothing up"
-    assert costs["search.widen=4"] == [[0.3, 0.5, 0.9]] * 4
+    assert costs["search.cost_width_start=4"] == [[0.3, 0.5, 0.9]] * 4
     assert "mean 0.567  median 0.500  below .35 33%, .6 67%  above .8 33%" in capsys.readouterr().out
 
 

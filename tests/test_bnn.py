@@ -154,11 +154,11 @@ def learned(std, *, kind="none", head="softplus", heteroscedastic=True, steps=15
         head=HEADS[head],
         heteroscedastic=heteroscedastic,
         weight_decay=0.01,
-        initialiser="glorot",
+        initializer="glorot",
     )
     data = observed(std)
     optimizer = optax.adam(optax.cosine_decay_schedule(1e-2, steps))
-    fitted = partial(fit, prepare=model.prepare, loss=model.loss, optimizer=optimizer, steps=steps, batch=64)
+    fitted = partial(fit, prepare=model.prepare, loss=model.loss, optimizer=optimizer, steps=steps, batch_size=64)
 
     @jax.jit
     def run(key, data):

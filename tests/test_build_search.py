@@ -27,7 +27,7 @@ from probes import PENDULUM, cart, known, linear_policy, tiny
 
 def searcher(gain=-0.5, scatter=0.0, **search):
     """An experiment under a config, its first state, and a one-step search from it, which weighs no fresh policy."""
-    plain = {"steps": 1, "particles": 5, "cost": "particles", "widen": 1.0, "restart": False}
+    plain = {"steps": 1, "particles": 5, "cost_estimator": "particles", "cost_width_start": 1.0, "init": "previous"}
     chosen = dataclasses.replace(tiny(), search=config.Search(**{**plain, **search}))
     policy = linear_policy(2, 1)._replace(
         init=lambda key: gain * jnp.array([[1.0, 1.6]]) + scatter * jax.random.normal(key, (1, 2))
@@ -43,37 +43,40 @@ def first_objective(**search):
 
 def test_settings_of_the_search_reach_the_objective():
     plain = first_objective()
-    changes = dict(match=False, balanced=True, aggregate="total", cost="matched", widen=2.0)
+    changes = dict(moment_matching=False, standardized_noise=True, cost_estimator="gaussian", cost_width_start=2.0)
     values = {name: first_objective(**{name: value}) for name, value in changes.items()}
-    np.testing.assert_allclose(values.pop("aggregate"), 2 * plain, rtol=1e-4)  # the sum over 2 steps
     assert all(abs(value - plain) > 1e-6 for value in values.values()), values
     assert len(set(values.values())) == len(values)
 
 
-@pytest.mark.parametrize("of", ["particles", "matched"])
+@pytest.mark.parametrize("of", ["particles", "gaussian"])
 def test_a_search_starts_with_the_wider_cost_and_ends_with_the_tasks(of):
     """A cost twice as wide is the task's cost of half the error; from half of the search on it is the task's own."""
-    wide = float(searcher(cost=of, widen=2.0)[2](searcher(cost=of)[1])[1].objective[0])
+    wide = float(searcher(cost_estimator=of, cost_width_start=2.0)[2](searcher(cost_estimator=of)[1])[1].objective[0])
     halved = cart(horizon=2)._replace(
         cost=cost.saturating(lambda x: x / 2, 1.0), expected_cost=cost.expected_saturating(lambda x: x / 2, 1.0, ())
     )
-    chosen = dataclasses.replace(tiny(), search=config.Search(steps=1, particles=5, cost=of, widen=1.0))
+    chosen = dataclasses.replace(
+        tiny(), search=config.Search(steps=1, particles=5, cost_estimator=of, cost_width_start=1.0)
+    )
     exp, state, _ = searcher()
     by_hand = compose(chosen, halved, dynamics=exp.dynamics, policy=exp.policy).search
     np.testing.assert_allclose(wide, jax.jit(by_hand)(state)[1].objective[0], rtol=1e-5)
-    slow = dict(cost=of, steps=4, learning_rate=1e-30)
-    narrowed, plain = (searcher(**slow, widen=widen) for widen in (2.0, 1.0))
+    slow = dict(cost_estimator=of, steps=4, learning_rate=1e-30)
+    narrowed, plain = (searcher(**slow, cost_width_start=widen) for widen in (2.0, 1.0))
     values = [run(state)[1].objective for _, state, run in (narrowed, plain)]
     np.testing.assert_allclose(values[0][2:], values[1][2:], rtol=1e-5)
     assert np.all(values[0][:2] < 0.9 * values[1][:2])
 
 
 HELD = dict(steps=4, period=Period(0, 0, 0, 0, 0))  # the same scenarios for every iteration
-ALONE = dict(match=False, **HELD)
+ALONE = dict(moment_matching=False, **HELD)
 
 
 def test_a_search_that_refines_for_no_iteration_weighs_once_at_its_end():
-    _, state, run = searcher(cost="matched", widen=2.0, refine=0.01, learning_rate=10.0, **HELD)
+    _, state, run = searcher(
+        cost_estimator="gaussian", cost_width_start=2.0, refine_fraction=0.01, learning_rate=10.0, **HELD
+    )
     after, info = run(state)
     assert np.array_equal(after.policy.params, state.policy.params)
     assert np.all(np.isfinite(info.objective))
@@ -82,15 +85,17 @@ def test_a_search_that_refines_for_no_iteration_weighs_once_at_its_end():
 
 def test_a_search_that_lost_its_way_refines_and_ends_with_the_policy_it_was_given():
     """With steps of 10 neither half is of use. What refines has no matching, and each particle's own cost."""
-    _, state, run = searcher(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
+    _, state, run = searcher(
+        cost_estimator="gaussian", cost_width_start=2.0, refine_fraction=0.5, learning_rate=10.0, **HELD
+    )
     (after, info), (_, _, alone) = run(state), searcher(learning_rate=1e-30, **ALONE)
     np.testing.assert_allclose(info.objective[1:], alone(state)[1].objective[0], rtol=1e-5)
     assert np.array_equal(after.policy.params, state.policy.params)
 
 
 def test_a_search_that_found_a_better_policy_refines_that():
-    better = dict(cost="matched", widen=1.0, learning_rate=0.02)
-    _, state, run = searcher(gain=-0.1, refine=0.5, **better, **HELD)
+    better = dict(cost_estimator="gaussian", cost_width_start=1.0, learning_rate=0.02)
+    _, state, run = searcher(gain=-0.1, refine_fraction=0.5, **better, **HELD)
     after, info = run(state)
     exp, _, _ = searcher(gain=-0.1, **better, **HELD)
     found, _ = jax.jit(partial(exp.search, steps=2))(state)
@@ -101,8 +106,8 @@ def test_a_search_that_found_a_better_policy_refines_that():
 
 def test_after_a_stale_search_the_next_begins_from_a_fresh_policy_and_keeps_the_old():
     """Nothing moves at this step size, so that the first search goes back to the policy it was given: a better one."""
-    still = dict(gain=0.3, refine=0.5, learning_rate=1e-30, cost="matched", **HELD)
-    (_, fresh, run), (_, _, obstinate) = searcher(restart=True, **still), searcher(**still)
+    still = dict(gain=0.3, refine_fraction=0.5, learning_rate=1e-30, cost_estimator="gaussian", **HELD)
+    (_, fresh, run), (_, _, obstinate) = searcher(init="better", **still), searcher(**still)
     good = -0.5 * jnp.array([[1.0, 1.6]])
     stale, info = run(fresh._replace(policy=Learner(good, fresh.policy.optimizer)))
     again, known = run(stale)
@@ -114,8 +119,8 @@ def test_after_a_stale_search_the_next_begins_from_a_fresh_policy_and_keeps_the_
 
 def test_a_search_that_always_begins_anew_keeps_a_policy_that_is_better():
     """As after a stale one, but from its first search on, and whatever the search before it found."""
-    still = dict(gain=0.3, refine=0.5, learning_rate=1e-30, cost="matched", restart=True, **HELD)
-    (_, fresh, run), (_, _, usual) = searcher(anew=True, **still), searcher(**still)
+    still = dict(gain=0.3, refine_fraction=0.5, learning_rate=1e-30, cost_estimator="gaussian", **HELD)
+    (_, fresh, run), (_, _, usual) = (searcher(init=init, **still) for init in ("fresh", "better"))
     good = -0.5 * jnp.array([[1.0, 1.6]])
     state = fresh._replace(policy=Learner(good, fresh.policy.optimizer))
     after, info = run(state)
@@ -125,16 +130,18 @@ def test_a_search_that_always_begins_anew_keeps_a_policy_that_is_better():
 
 
 def test_after_a_search_that_found_a_better_policy_the_next_begins_from_that():
-    better = dict(gain=-0.1, cost="matched", widen=1.0, learning_rate=0.02, refine=0.5, **HELD)
-    _, state, run = searcher(restart=True, **better)
+    better = dict(
+        gain=-0.1, cost_estimator="gaussian", cost_width_start=1.0, learning_rate=0.02, refine_fraction=0.5, **HELD
+    )
+    _, state, run = searcher(init="better", **better)
     after, _ = run(state)
     _, _, obstinate = searcher(**better)
     assert run(after)[1].objective[0] == obstinate(after)[1].objective[0] != run(state)[1].objective[0]
 
 
 def test_of_several_that_lost_their_way_the_best_that_was_given_goes_on():
-    lost = dict(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
-    _, state, run = searcher(scatter=0.3, starts=3, **lost)
+    lost = dict(cost_estimator="gaussian", cost_width_start=2.0, refine_fraction=0.5, learning_rate=10.0, **HELD)
+    _, state, run = searcher(scatter=0.3, num_starts=3, **lost)
     after, info = run(state)
     members = after.policy.optimizer.params
     assert np.array_equal(members[0], state.policy.params)
@@ -153,12 +160,14 @@ def test_what_refines_is_imagined_as_it_was_searched():
         exp, state, _ = searcher(**search)
         return jax.jit(exp.imagine)(state)[1]
 
-    assert np.array_equal(fresh(refine=0.5), fresh(match=False))
-    assert not np.array_equal(fresh(refine=0.0), fresh(match=False))
+    assert np.array_equal(fresh(refine_fraction=0.5), fresh(moment_matching=False))
+    assert not np.array_equal(fresh(refine_fraction=0.0), fresh(moment_matching=False))
 
 
 def test_a_refining_search_in_parts_is_the_whole():
-    exp, state, run = searcher(cost="matched", widen=2.0, refine=0.5, learning_rate=10.0, **HELD)
+    exp, state, run = searcher(
+        cost_estimator="gaussian", cost_width_start=2.0, refine_fraction=0.5, learning_rate=10.0, **HELD
+    )
     part, parts = jax.jit(partial(exp.search, steps=1)), state
     for first in range(4):
         parts, _ = part(parts, first)
@@ -179,12 +188,14 @@ def test_what_is_weighed_needs_no_second_program(monkeypatch):
         jax.eval_shape(exp.search, state)
         return len(traced)
 
-    assert times(refine=0.5, restart=True) == times(refine=0.5) == times() > 0
+    assert times(refine_fraction=0.5, init="better") == times(refine_fraction=0.5) == times() > 0
 
 
 def test_an_annealing_search_goes_on_where_that_of_the_trial_before_ended():
     """Two searches of two iterations narrow as one of four; in a third the cost is the task's, the step size 0."""
-    course = dict(steps=2, learning_rate=1e-4, widen=2.0, decay=0.0, anneal=2, period=Period(0, 0, 0, 0, 0))
+    course = dict(
+        steps=2, learning_rate=1e-4, cost_width_start=2.0, decay=0.0, anneal_trials=2, period=Period(0, 0, 0, 0, 0)
+    )
     _, state, run = searcher(**course)
     _, _, plain = searcher(**{**course, "widen": 1.0, "learning_rate": 1e-30, "anneal": 1})
     moved = []
@@ -202,19 +213,19 @@ def test_an_annealing_search_goes_on_where_that_of_the_trial_before_ended():
 
 
 def test_an_annealing_search_has_one_course():
-    with pytest.raises(ConfigError, match=r"search.anneal=2 needs search.refine=0"):
-        config.Search(anneal=2, refine=0.5)
+    with pytest.raises(ConfigError, match=r"search.anneal_trials=2 needs search.refine_fraction=0"):
+        config.Search(anneal_trials=2, refine_fraction=0.5)
 
 
 def test_a_cost_without_a_width_cannot_be_widened():
-    task = cart(horizon=2)._replace(widened=None)
-    with pytest.raises(ConfigError, match=r"search\.widen=4 needs a cost with a width.*the nearest is 1"):
+    task = cart(horizon=2)._replace(cost_with_width=None)
+    with pytest.raises(ConfigError, match=r"search\.cost_width_start=4 needs a cost with a width.*the nearest is 1"):
         compose(tiny(), task)
 
 
 def test_the_matched_cost_of_any_function_is_that_of_its_nodes():
     """Near the closed form of the same cost, which was not asked for; and of no width."""
-    task, search = cart(horizon=3), config.Search(cost="matched", widen=1)
+    task, search = cart(horizon=3), config.Search(cost_estimator="gaussian", cost_width_start=1)
     x = 0.4 * jax.random.normal(jax.random.key(0), (3, 20, len(task.state_names)))
     own = costs_of(search, task._replace(expected_cost=None))(None, None)(x)
     known = costs_of(search, task)(None, None)(x)
@@ -226,7 +237,11 @@ def test_the_matched_cost_of_any_function_is_that_of_its_nodes():
 
 
 def test_a_limit_reaches_the_gradient_as_a_share_of_each_particle():
-    (_, state, run), (_, _, limited), (_, _, loose) = searcher(), searcher(limit=1e-3), searcher(limit=1e6)
+    (_, state, run), (_, _, limited), (_, _, loose) = (
+        searcher(),
+        searcher(particle_grad_limit=1e-3),
+        searcher(particle_grad_limit=1e6),
+    )
     plain, short, same = (f(state)[1] for f in (run, limited, loose))
     assert plain.objective[0] == short.objective[0]
     assert short.gradient_norm[0] < 0.9 * plain.gradient_norm[0]
@@ -236,10 +251,22 @@ def test_a_limit_reaches_the_gradient_as_a_share_of_each_particle():
 @pytest.mark.parametrize(
     ("search", "message"),
     [
-        (dict(reheat=0.3, decay=0.1), "search.reheat=0.3 needs searches that cool, search.anneal=10"),
-        (dict(reheat=0.3, anneal=10), "search.reheat=0.3 needs searches that cool, search.anneal=10"),
-        (dict(loosen=30, limit=1.0), "search.loosen=30 needs search.limit=1 search.reheat=0.3"),
-        (dict(loosen=30, reheat=0.3, anneal=10, decay=0.1), "search.loosen=30 needs search.limit=1 search.reheat=0.3"),
+        (
+            dict(warm_restart=0.3, decay=0.1),
+            "search.warm_restart=0.3 needs searches that cool, search.anneal_trials=10",
+        ),
+        (
+            dict(warm_restart=0.3, anneal_trials=10),
+            "search.warm_restart=0.3 needs searches that cool, search.anneal_trials=10",
+        ),
+        (
+            dict(warm_limit_factor=30, particle_grad_limit=1.0),
+            "search.warm_limit_factor=30 needs search.particle_grad_limit=1 search.warm_restart=0.3",
+        ),
+        (
+            dict(warm_limit_factor=30, warm_restart=0.3, anneal_trials=10, decay=0.1),
+            "search.warm_limit_factor=30 needs search.particle_grad_limit=1 search.warm_restart=0.3",
+        ),
     ],
 )
 def test_only_what_is_annealed_is_reheated_and_only_a_limit_loosened(search, message):
@@ -249,8 +276,8 @@ def test_only_what_is_annealed_is_reheated_and_only_a_limit_loosened(search, mes
 
 def test_after_the_annealed_searches_each_is_reheated_and_its_limit_loosened():
     """Trials 2, 3 and 4 under the same scenarios: 1 and 2 are annealed, to a step of nothing; one step each."""
-    course = dict(steps=1, learning_rate=1e-4, decay=0.0, anneal=2, period=Period(0, 0, 0, 0, 0))
-    _, state, run = searcher(**course, limit=1e-3, reheat=0.3, loosen=1e9)
+    course = dict(steps=1, learning_rate=1e-4, decay=0.0, anneal_trials=2, period=Period(0, 0, 0, 0, 0))
+    _, state, run = searcher(**course, particle_grad_limit=1e-3, warm_restart=0.3, warm_limit_factor=1e9)
     _, _, plain = searcher(**course)
     at = [state._replace(trial=jnp.int32(trial)) for trial in (2, 3, 4)]
     moved = [np.max(np.abs(run(before)[0].policy.params - before.policy.params)) for before in at]
@@ -281,7 +308,7 @@ def test_a_falling_step_size_reaches_the_fit():
     dynamics, moved = dynamics_of(config.BNN(hidden=(4,)), cart()), {}
     row = jnp.ones((1, 2)), jnp.ones((1, 1)), jnp.ones((1, 2))
     for decay in (1.0, 0.0):
-        fit = fit_of(config.Fit(steps=2, batch=1, decay=decay, learning_rate=1e-5), dynamics)
+        fit = fit_of(config.Fit(steps=2, batch_size=1, decay=decay, learning_rate=1e-5), dynamics)
         params = dynamics.init(jax.random.key(0))
         learner, _ = fit.run(jax.random.key(1), Learner(params, fit.init(params)), Dataset(*row, jnp.int32(1)), 2)
         moved[decay] = np.abs(ravel_pytree(learner.params)[0] - ravel_pytree(params)[0]).max()
@@ -292,7 +319,7 @@ def test_each_factor_of_the_noise_reaches_its_place():
     """What the policy sees decides its controls, the state's own noise the states."""
 
     def imagined(**search):
-        exp, state, _ = searcher(**{"match": False, "policy_noise": 0.0, **search})
+        exp, state, _ = searcher(**{"moment_matching": False, "policy_noise": 0.0, **search})
         return jax.jit(exp.imagine)(state)[0]
 
     plain = imagined()
@@ -303,25 +330,27 @@ def test_each_factor_of_the_noise_reaches_its_place():
     told = imagined(policy_noise=0.5)
     np.testing.assert_allclose((told.u - plain.u)[1, :, 0], 0.5 * blur @ np.array([-0.5, -0.8]), atol=1e-5)
     assert np.array_equal(told.x[1], plain.x[1])
-    known = imagined(policy_noise=1.0, sensors="known")  # .01 of the plant, and not the .2 that the model predicts
+    known = imagined(
+        policy_noise=1.0, observation_noise="plant"
+    )  # .01 of the plant, and not the .2 that the model predicts
     np.testing.assert_allclose((known.u - plain.u)[1, :, 0], blur / 20 @ np.array([-0.5, -0.8]), atol=1e-6)
 
 
 def test_sensors_that_are_not_known_cannot_be_expected():
     task = cart()._replace(sensor_std=np.zeros(2))
-    with pytest.raises(ConfigError, match=r"search.sensors=known needs .* task=cart is not; the nearest is"):
-        compose(dataclasses.replace(tiny(), search=config.Search(sensors="known")), task)
+    with pytest.raises(ConfigError, match=r"search.observation_noise=plant needs .* task=cart is not; the nearest is"):
+        compose(dataclasses.replace(tiny(), search=config.Search(observation_noise="plant")), task)
 
 
 def test_as_few_particles_as_are_allowed_do():
-    assert np.isfinite(first_objective(particles=3, balanced=True))
+    assert np.isfinite(first_objective(particles=3, standardized_noise=True))
 
 
 def test_clipping_reaches_the_optimizer():
     """Adam's step hides the size of a gradient; its first moment, a tenth of what it was given, does not."""
     moved = {}
     for clip in (None, 1e-6):
-        _, state, run = searcher(clip=clip)
+        _, state, run = searcher(grad_clip=clip)
         state, info = run(state)
         moved[clip] = float(jnp.linalg.norm(state.policy.optimizer.optimizer[1][0].mu))
         assert info.gradient_norm[0] > 1e-4
@@ -334,7 +363,7 @@ def test_the_search_minimizes_what_objective_says():
     exp, state, run = searcher()
     pieces = dict(dynamics=exp.dynamics, policy=exp.policy)
     of_task = partial(start, task=exp.task)
-    blocks = scenarios.blocks(**pieces, start=of_task, particles=5, horizon=2, balanced=False)
+    blocks = scenarios.blocks(**pieces, start=of_task, particles=5, horizon=2, standardized_noise=False)
     given = scenarios.draw(trial_key(state.key, 0, SEARCH), 0, None, blocks=blocks, period=types.Period())
     of_particles = cost.of_particles(exp.task.cost)
     by_hand = objective(state.policy.params, None, given, **pieces, match=matching.match, cost=of_particles)

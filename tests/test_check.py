@@ -65,7 +65,7 @@ class Twice(Arm):
 for kind in (Arm, Degrees, Fails, Twice):
     gymnasium.register(f"{kind.__name__}-v0", kind)
 """
-WORDS = ["task=gym", "angles=[0]", "horizon=5", "evaluation=0"]
+WORDS = ["task=gym", "angles=[0]", "horizon=5", "eval_episodes=0"]
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=1"]
 
 

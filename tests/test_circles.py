@@ -106,9 +106,9 @@ def test_none_is_found_where_there_is_none(plant: Any) -> None:
 )
 def test_on_plants_of_gymnasium(env: str, pairs: circles.Circles) -> None:
     config = Config(task="gym", env=env, cost=f"{__name__}:upright", horizon=5)
-    known = tasks.pinned(config)
+    known = tasks.resolve(config)
     assert known.circles == pairs
-    assert tasks.pinned(replace(config, circles=())).circles == ()
+    assert tasks.resolve(replace(config, circles=())).circles == ()
     task = tasks.of_config(known)
     seen = resets_of(env)
     assert seen.shape == (100, len(task.state_names) + len(pairs))
@@ -155,9 +155,9 @@ def test_starts_that_hang_are_not_torn_at_the_seam() -> None:
 
 
 def learned(folder: Path, env: str, cost: str, **given: Any) -> Path:
-    config = tiny(trials=2, search__steps=5, search__widen=1.0, fit__steps=20, evaluation=2)
+    config = tiny(trials=2, search__steps=5, search__cost_width_start=1.0, fit__steps=20, eval_episodes=2)
     config = replace(config, task="gym", env=env, cost=f"{__name__}:{cost}", horizon=6, **given)
-    known = tasks.pinned(config)
+    known = tasks.resolve(config)
     train(known, store.create(folder))
     return folder
 

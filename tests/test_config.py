@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from pegasus_jax.checks import ConfigError, nearest
-from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
+from pegasus_jax.checks import ConfigError, did_you_mean
+from pegasus_jax.config import BNN, MLP, Analytic, Config, Explore, Fit, Period, Search
 from pegasus_jax.config_models import DROPOUTS
 
 
@@ -34,28 +34,28 @@ def test_the_defaults_are_the_measured_ones():
         True,
     )
     assert (c.policy.hidden, c.policy.dropout) == ((200, 200), 0.0)
-    assert (c.fit.steps, c.fit.batch, c.fit.learning_rate) == (2000, 100, 3e-4)
-    assert (c.search.steps, c.search.particles, c.search.learning_rate, c.search.clip) == (1000, 100, 1e-3, 1.0)
-    assert (c.search.match, c.search.aggregate) == (True, "mean")
+    assert (c.fit.steps, c.fit.batch_size, c.fit.learning_rate) == (2000, 100, 3e-4)
+    assert (c.search.steps, c.search.particles, c.search.learning_rate, c.search.grad_clip) == (1000, 100, 1e-3, 1.0)
+    assert (c.search.moment_matching, c.search.standardized_noise) == (True, False)
     assert c.search.period == Period(start=1, dynamics=100, policy=1, sensor=1, match=1)
-    assert (c.model.activation, c.model.kl_weight, c.search.restart) == ("silu", 0.1, True)
-    assert (c.search.cost, c.search.widen) == ("matched", 4.0)  # docs/decisions/0002
+    assert (c.model.activation, c.model.kl_weight, c.search.init) == ("silu", 0.1, "better")
+    assert (c.search.cost_estimator, c.search.cost_width_start) == ("gaussian", 4.0)  # docs/decisions/0002
     assert (c.explore.trials, c.explore.kind) == (1, "uniform")
 
 
 IMPOSSIBLE = [
     (BNN, dict(hidden=(50, 0)), "model.hidden=0"),
     (BNN, dict(dropout="lognormal"), "'log_normal'"),
-    (BNN, dict(initialiser="glorrot"), "'glorot'"),
+    (BNN, dict(initializer="glorrot"), "'glorot'"),
     (BNN, dict(weight_decay=-1.0), "model.weight_decay=-1"),
-    (BNN, dict(low=0.0), "model.low=0"),
-    (BNN, dict(low=-math.inf), "model.low=-inf"),
-    (BNN, dict(low=math.nan), "model.low=nan"),
+    (BNN, dict(log_z_min=0.0), "model.log_z_min=0"),
+    (BNN, dict(log_z_min=-math.inf), "model.log_z_min=-inf"),
+    (BNN, dict(log_z_min=math.nan), "model.log_z_min=nan"),
     (MLP, dict(hidden=(-3,)), "policy.hidden=-3"),
     (MLP, dict(squash="tan"), "'tanh'"),
     (MLP, dict(dropout=1.0), "the nearest is 0.99"),
     (Fit, dict(steps=0), "the nearest is 1"),
-    (Fit, dict(batch=0), "fit.batch=0"),
+    (Fit, dict(batch_size=0), "fit.batch_size=0"),
     (Fit, dict(learning_rate=0.0), "(0, inf)"),
     (Fit, dict(learning_rate=math.nan), "fit.learning_rate=nan"),
     (Period, dict(start=-1), "search.period.start=-1"),
@@ -63,10 +63,11 @@ IMPOSSIBLE = [
     (Search, dict(steps=0), "search.steps=0"),
     (Search, dict(particles=1), "the nearest is 2"),
     (Search, dict(learning_rate=-1e-3), "search.learning_rate=-0.001"),
-    (Search, dict(clip=0.0), "search.clip=0"),
-    (Search, dict(anew=True), "search.refine=0.5; the nearest is false"),
-    (Search, dict(anew=True, refine=0.5, restart=False), "search.restart=true"),
-    (Search, dict(aggregate="sum"), "mean, total"),
+    (Search, dict(grad_clip=0.0), "search.grad_clip=0"),
+    (Search, dict(init="fresh"), "search.refine_fraction=0.5; the nearest is better"),
+    (Search, dict(init="new"), "previous, better, fresh"),
+    (Analytic, dict(init="fresh"), "previous, better"),
+    (Search, dict(observation_noise="plants"), "did you mean 'plant'?"),
     (Search, dict(state_noise=-1.0), "search.state_noise=-1"),
     (Explore, dict(trials=-1), "explore.trials=-1"),
     (Explore, dict(kind="walking"), "'walk'"),
@@ -86,9 +87,14 @@ IMPOSSIBLE = [
     (Config, dict(dt="fast"), "dt=fast is not a number or null"),
     (Config, dict(dt=1e9), "the nearest is"),
     (Config, dict(success=0.0), "success=0"),
+    (Config, dict(x64="double"), "x64=double is not true or false"),
     (Search, dict(steps=1.5), "search.steps=1.5 is not a whole number"),
-    (Search, dict(match="no"), "search.match=no is not true or false; for example search.match=true"),
-    (Search, dict(clip="none"), "search.clip=none is not a number or null"),
+    (
+        Search,
+        dict(moment_matching="no"),
+        "search.moment_matching=no is not true or false; for example search.moment_matching=true",
+    ),
+    (Search, dict(grad_clip="none"), "search.grad_clip=none is not a number or null"),
     (Search, dict(steps=10**20), "the nearest is 10000000"),
     (Period, dict(match=None), "search.period.match=null is not a whole number"),
     (MLP, dict(squash=None), "policy.squash=null is not a word"),
@@ -116,12 +122,12 @@ def test_numbers_of_numpy_become_pythons_own():
 def test_limits_themselves_are_possible():
     BNN(weight_decay=0.0, hidden=(1,))
     MLP(dropout=0.0)
-    Fit(steps=1, batch=1, learning_rate=1e-12)
-    Search(steps=1, particles=2, clip=None)
+    Fit(steps=1, batch_size=1, learning_rate=1e-12)
+    Search(steps=1, particles=2, grad_clip=None)
     Explore(trials=0)
     Config(seed=2**32 - 1, trials=1)
 
 
 def test_the_nearest_choice():
-    assert nearest("lognormal", DROPOUTS) == f"did you mean 'log_normal'? choices: {', '.join(DROPOUTS)}"
-    assert nearest("xyz", ("tanh", "sine")) == "choices: tanh, sine"
+    assert did_you_mean("lognormal", DROPOUTS) == f"did you mean 'log_normal'? choices: {', '.join(DROPOUTS)}"
+    assert did_you_mean("xyz", ("tanh", "sine")) == "choices: tanh, sine"

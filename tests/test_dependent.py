@@ -35,7 +35,7 @@ class Tip(gymnasium.Env):
 
 gymnasium.register("Tip-v0", Tip)
 """
-WORDS = "task=gym env=robot:Tip-v0 cost=robot:cost angles=[0] horizon=40 trials=2 evaluation=0 fit.steps=100"
+WORDS = "task=gym env=robot:Tip-v0 cost=robot:cost angles=[0] horizon=40 trials=2 eval_episodes=0 fit.steps=100"
 TINY = "search.steps=20 search.particles=30 model.hidden=[20] policy.hidden=[20] out=run"
 
 

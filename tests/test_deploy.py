@@ -22,7 +22,7 @@ X = np.array([0.1, -0.2, 0.3, 3.0])
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     home = tmp_path_factory.mktemp("runs")
-    return {name: a_run(home / name, precision=name) for name in ("single", "double")}
+    return {name: a_run(home / name, x64=wide) for name, wide in (("single", "false"), ("double", "true"))}
 
 
 @pytest.mark.parametrize("name", ["single", "double"])

@@ -77,7 +77,7 @@ SMALL = {  # a part of a command -> a setting that makes it small, unless the co
     "model=": "model.hidden=[8]",
     "policy=": "policy.hidden=[8]",
     "algorithm=pilco": "search.particles=8",
-    "evaluation=": "evaluation=1",
+    "eval_episodes=": "eval_episodes=1",
 }
 
 

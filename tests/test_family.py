@@ -22,17 +22,17 @@ UPRIGHT = np.array([0, 0, 0, np.pi])
 # What is small of each kind of section; a word counts only where the section has such a setting.
 SMALL = {
     "model.hidden": "[8]",
-    "model.members": "2",
+    "model.ensemble_size": "2",
     "model.substeps": "1",
     "policy.hidden": "[8]",
-    "policy.units": "5",
+    "policy.num_centers": "5",
     "fit.steps": "2",
-    "fit.starts": "2",
+    "fit.num_starts": "2",
     "search.steps": "2",
     "search.particles": "6",
     # test_trial.py and test_build_search.py have these; here they would be half of each program to compile.
-    "search.restart": "false",
-    "search.refine": "0",
+    "search.init": "previous",
+    "search.refine_fraction": "0",
     "trials": "3",
 }
 PIECES = [policy for policy in POLICIES if policy != "rbf100"]  # which is rbf with more units
@@ -59,9 +59,14 @@ def composed(model, policy, how):
     there = config_io.leaves(config_io.parse(chosen))
     small = {key: value for key, value in SMALL.items() if key in there}
     if model != "ensemble":
-        small.pop("model.members", None)
+        small.pop("model.ensemble_size", None)
     if how == "kept":
-        small |= {"search.match": "false", "search.cost": "particles", "search.widen": "1", "search.restart": "false"}
+        small |= {
+            "search.moment_matching": "false",
+            "search.cost_estimator": "particles",
+            "search.cost_width_start": "1",
+            "search.init": "previous",
+        }
     config, task = config_io.parse(chosen | small), make("cartpole")
     error, angles = task.plant.error, task.angles
     task = task._replace(
@@ -70,7 +75,7 @@ def composed(model, policy, how):
         start_std=np.full(4, 0.02),
         cost=saturating(error, WIDTH),
         expected_cost=expected_saturating(error, WIDTH, angles),
-        widened=partial(widened, error, WIDTH, angles),
+        cost_with_width=partial(widened, error, WIDTH, angles),
     )
     dynamics = dynamics_of(config.model, task)
     apply, moments = Counter(dynamics.apply), dynamics.moments and Counter(dynamics.moments)

@@ -14,8 +14,8 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import BNN, RBF, SSGP, Analytic, Config
 from pegasus_jax.studies import claims, comparison
 from pegasus_jax.studies.figures import Claim, Figure, read
-from pegasus_jax.studies.study import first_solved, seed_list, short, study
-from pegasus_jax.viz.learning_curves import interval, middle
+from pegasus_jax.studies.study import first_solved, rounded, seed_list, study
+from pegasus_jax.viz.learning_curves import interval, iqm
 from probes import unchecked
 from test_train import call
 
@@ -26,10 +26,11 @@ title = "Two clips"
 seeds = "3-4"
 trials = 2
 common = "model=deterministic policy=linear model.hidden=[4] fit.steps=2 search.steps=2 search.particles=5 \
-search.match=false search.cost=particles search.widen=1 search.restart=false search.refine=0"
+search.moment_matching=false search.cost_estimator=particles search.cost_width_start=1 \
+search.init=previous search.refine_fraction=0"
 [variants]
-loose = "search.clip=1"
-tight = "search.clip=1e-3"
+loose = "search.grad_clip=1"
+tight = "search.grad_clip=1e-3"
 [[claims]]
 says = "tight is better"
 lower = "tight"
@@ -72,9 +73,9 @@ def test_the_figures_vary_what_the_paper_varies():
     assert {config.search.learning_rate for config in crn.values()} == {1e-4}
     assert vars(crn["fixed"].search.period) == dict(start=1, dynamics=0, policy=0, sensor=0, match=0)
     assert set(vars(crn["fresh"].search.period).values()) == {1}
-    assert [config.search.clip for config in clip.values()] == [None, 1000, 100, 10, 1, 0.1, 0.01, 0.001]
+    assert [config.search.grad_clip for config in clip.values()] == [None, 1000, 100, 10, 1, 0.1, 0.01, 0.001]
     rbf = comparison.configs(FIGURES["rbf"])
-    assert all(isinstance(config.policy, RBF) and config.policy.units == 30 for config in rbf.values())
+    assert all(isinstance(config.policy, RBF) and config.policy.num_centers == 30 for config in rbf.values())
     assert isinstance(rbf["ssgp_pilco"].model, SSGP)
     assert isinstance(rbf["ssgp_pilco"].search, Analytic)
     for name, task in (("nn", "cartpole"), ("double", "double_cartpole")):
@@ -108,14 +109,14 @@ def test_claims_cite_variants_and_trials_that_there_are(name):
         ('title = "Two clips"', 'title = "Two', "is not TOML"),
         ('title = "Two clips"', 'title = "a"\npicture = "curve"', "did you mean 'curves'"),
         ("loose =", '"a/b" =', "'a/b' cannot be part of a file's name"),
-        ('"search.clip=1"', "1", "variant loose is not a text of settings"),
+        ('"search.grad_clip=1"', "1", "variant loose is not a text of settings"),
         (
-            "search.clip=1e-3",
+            "search.grad_clip=1e-3",
             "search.clop=1",
-            "variant tight: search.clop is not a setting; did you mean 'search.clip'",
+            "variant tight: search.clop is not a setting; did you mean 'search.grad_clip'",
         ),
-        ("search.clip=1e-3", "search.clip=-1", "variant tight: search.clip=-1 is out of range"),
-        ("search.clip=1e-3", "algorithm=pilco", "variant tight: "),
+        ("search.grad_clip=1e-3", "search.grad_clip=-1", "variant tight: search.grad_clip=-1 is out of range"),
+        ("search.grad_clip=1e-3", "algorithm=pilco", "variant tight: "),
         ("policy=linear", "policy=linea", "policy=linea is unknown; did you mean 'linear'"),
         ('than = "loose"', "", "a claim has says, lower, than, trials"),
         ("trials = [1, 2]", "trials = [2, 1]", "trials=[2, 1] are not first and last"),
@@ -170,7 +171,7 @@ def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
     tight = json.loads((out / "mine-tight.json").read_text())
     assert np.shape(tight["mean_cost"]) == np.shape(tight["objective_fresh"]) == (2, 2)
     assert tight["seeds"] == [3, 4]
-    assert tight["config"]["search.clip"] == 1e-3
+    assert tight["config"]["search.grad_clip"] == 1e-3
     assert [row[0] for row in tight["calibration"]] == [None, None]  # nothing was known before the first trial
     assert all(row[1] > 0 for row in tight["calibration"])
     assert "pegasus-figures mine.toml" in tight["about"]["command"]
@@ -178,10 +179,10 @@ def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
     assert "tight is better" in second.stdout
 
     both = {path: path.read_bytes() for path in out.glob("*.json")}
-    third = call("figures", "mine.toml", "out=there", "search.clip=7", cwd=tmp_path)
+    third = call("figures", "mine.toml", "out=there", "search.grad_clip=7", cwd=tmp_path)
     assert third.returncode == 0, third.stderr
     assert {path: path.read_bytes() for path in out.glob("*.json")} == both
-    assert "mine-loose.json was made with search.clip=1.0, not 7.0" in third.stderr
+    assert "mine-loose.json was made with search.grad_clip=1.0, not 7.0" in third.stderr
     assert (out / "mine.png").read_bytes().startswith(b"\x89PNG")
 
 
@@ -227,7 +228,7 @@ def test_verdicts_follow_from_the_numbers(tmp_path):
     write_study(tmp_path, "mine-loose", np.array([0.9, 0.6, 0.6, 0.4]) + noise[::-1])
 
     def verdict(lower, than, *trials):
-        return claims.judge(Claim("", lower, than, trials), figure, tmp_path).verdict
+        return claims.test_claim(Claim("", lower, than, trials), figure, tmp_path).verdict
 
     assert verdict("tight", "loose", 1, 1) == "no difference"
     assert verdict("tight", "loose", 2, 3) == verdict("tight", "mine-loose", 1, 4) == "agrees"
@@ -242,28 +243,28 @@ def test_the_same_seeds_are_compared_in_pairs(tmp_path):
     wide = np.linspace(0.2, 0.9, 12)[:, None] + np.zeros((12, 2))
     write_study(tmp_path, "mine-tight", wide)
     write_study(tmp_path, "mine-loose", wide + 0.02)
-    assert claims.judge(figure.claims[0], figure, tmp_path).verdict == "agrees"
+    assert claims.test_claim(figure.claims[0], figure, tmp_path).verdict == "agrees"
     path = tmp_path / "mine-loose.json"
     path.write_text(json.dumps(json.loads(path.read_text()) | {"seeds": [*range(50, 62)]}))
-    assert claims.judge(figure.claims[0], figure, tmp_path).verdict == "undecided"
+    assert claims.test_claim(figure.claims[0], figure, tmp_path).verdict == "undecided"
 
 
 def test_one_seed_decides_nothing(tmp_path):
     figure = figure_of(tmp_path, TINY)
     write_study(tmp_path, "mine-tight", np.full((1, 2), 0.1))
     write_study(tmp_path, "mine-loose", np.full((1, 2), 0.9))
-    assert claims.judge(figure.claims[0], figure, tmp_path).verdict == "undecided"
+    assert claims.test_claim(figure.claims[0], figure, tmp_path).verdict == "undecided"
 
 
 def test_the_interval_covers_the_middle_and_that_of_a_difference_is_antisymmetric():
     samples = np.random.default_rng(2).normal(size=(2, 12))
     low, high = interval(samples[0])
-    assert low < middle(samples[0]) < high
+    assert low < iqm(samples[0]) < high
     low, high = interval(*samples)
-    assert low < middle(samples[0]) - middle(samples[1]) < high
+    assert low < iqm(samples[0]) - iqm(samples[1]) < high
     np.testing.assert_allclose(interval(samples[1], samples[0]), (-high, -low), atol=0.15)
     many = np.random.default_rng(3).normal(size=(12, 3))
-    np.testing.assert_allclose(middle(many), [np.sort(column)[3:-3].mean() for column in many.T])
+    np.testing.assert_allclose(iqm(many), [np.sort(column)[3:-3].mean() for column in many.T])
 
 
 def test_when_seeds_were_solved():
@@ -301,7 +302,7 @@ def test_a_figure_that_was_drawn_is_shown(tmp_path, monkeypatch):
 
 
 def test_unknown_numbers_are_null_and_seeds_are_lists_or_ranges():
-    assert short([[0.123456, np.nan]]) == [[0.1235, None]]
+    assert rounded([[0.123456, np.nan]]) == [[0.1235, None]]
     assert seed_list("0-3") == [0, 1, 2, 3]
     assert seed_list("5,2") == [5, 2]
     assert seed_list("7") == [7]

@@ -31,16 +31,16 @@ def squares(params, key, batch, context):
     return jnp.mean(jnp.sum((batch.y - batch.x @ params.T) ** 2, -1))
 
 
-def make(loss=squares, optimizer=None, steps=50, batch=8, prepare=lambda data: None):
+def make(loss=squares, optimizer=None, steps=50, batch_size=8, prepare=lambda data: None):
     optimizer = optimizer or optax.adam(optax.cosine_decay_schedule(0.1, steps))
-    fitted = jax.jit(partial(fit, prepare=prepare, loss=loss, optimizer=optimizer, steps=steps, batch=batch))
+    fitted = jax.jit(partial(fit, prepare=prepare, loss=loss, optimizer=optimizer, steps=steps, batch_size=batch_size))
     return fitted, Learner(jnp.zeros((2, 2)), optimizer.init(jnp.zeros((2, 2))))
 
 
 @pytest.mark.parametrize("junk", [0.0, np.nan])
 def test_it_finds_the_least_squares_of_the_rows_in_use(junk):
     """One row beyond `size` in one batch, and the result is not a number."""
-    fitted, learner = make(steps=1500, batch=64)
+    fitted, learner = make(steps=1500, batch_size=64)
     learner, info = fitted(jax.random.key(0), learner, data(junk))
     expected = np.linalg.lstsq(X, Y, rcond=None)[0].T
     np.testing.assert_allclose(learner.params, expected, atol=0.03)
@@ -117,7 +117,7 @@ OPTIMIZERS = {
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_any_optimizer_fits_and_is_handed_back_in_its_own_state(name):
     optimizer = OPTIMIZERS[name]
-    fitted, learner = make(optimizer=optimizer, steps=200, batch=32)
+    fitted, learner = make(optimizer=optimizer, steps=200, batch_size=32)
     after, info = fitted(jax.random.key(0), learner, data(0))
     assert info.loss < 0.5 * info.first
     assert info.skipped == 0

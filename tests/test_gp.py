@@ -207,7 +207,7 @@ def noisy_curve(rows=100, capacity=120, seed=0):
 
 
 def fitted(model, starts=5, steps=100):
-    fitter = full_data(model, starts=starts)
+    fitter = full_data(model, num_starts=starts)
 
     @jax.jit
     def run(key, data):
@@ -255,7 +255,7 @@ def degenerate(name):
 def test_no_data_make_nan(kind):
     """One program, any data: it is traced once, and every number it makes is finite in float32."""
     model = MODELS[kind](**SHAPES)
-    fitter, traces = full_data(model, starts=3), 0
+    fitter, traces = full_data(model, num_starts=3), 0
 
     @jax.jit
     def everything(data):

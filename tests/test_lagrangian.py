@@ -80,7 +80,7 @@ def fitted(data):
     known = data._replace(size=jnp.int32(150))
     optimizer = optax.adam(1e-2)
     params = model.init(jax.random.key(1))
-    learn = partial(fit, prepare=model.prepare, loss=model.loss, optimizer=optimizer, steps=1500, batch=50)
+    learn = partial(fit, prepare=model.prepare, loss=model.loss, optimizer=optimizer, steps=1500, batch_size=50)
     learner, info = jax.jit(learn)(jax.random.key(2), Learner(params, optimizer.init(params)), known)
     assert int(info.skipped) == 0
     return model, model.posterior(learner.params, known)

@@ -78,7 +78,7 @@ def linear(spread=1.0):
 
 
 def test_it_finds_the_least_squares():
-    fitter = full_data(linear(), starts=3)
+    fitter = full_data(linear(), num_starts=3)
     run = jax.jit(fitter.run, static_argnums=3)
     learner, info = run(jax.random.key(0), Learner(jnp.zeros((3, 2)), fitter.init(None)), data(), 50)
     np.testing.assert_allclose(learner.params, SLOPE, atol=1e-3)
@@ -87,7 +87,7 @@ def test_it_finds_the_least_squares():
 
 def test_it_starts_from_the_best_of_its_starts_and_the_current_parameters():
     model = linear(spread=2.0)
-    fitter = full_data(model, starts=20)
+    fitter = full_data(model, num_starts=20)
     run = jax.jit(fitter.run, static_argnums=3)
     poor = Learner(jnp.full((3, 2), 50.0), fitter.init(None))
     started = run(jax.random.key(0), poor, data(), 0)
@@ -100,7 +100,7 @@ def test_it_starts_from_the_best_of_its_starts_and_the_current_parameters():
 
 
 def test_a_start_that_is_not_finite_is_not_chosen():
-    fitter = full_data(linear(), starts=2)
+    fitter = full_data(linear(), num_starts=2)
     run = jax.jit(fitter.run, static_argnums=3)
     learner, info = run(jax.random.key(0), Learner(jnp.full((3, 2), jnp.nan), fitter.init(None)), data(), 50)
     np.testing.assert_allclose(learner.params, SLOPE, atol=1e-3)

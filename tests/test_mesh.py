@@ -10,7 +10,7 @@ from pegasus_jax import sharding
 
 @pytest.fixture
 def two_gpus(monkeypatch: pytest.MonkeyPatch) -> None:
-    """This processor, taken for the first of two GPUs."""
+    """This CPU, taken for the first of two GPUs."""
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     monkeypatch.setattr(jax, "device_count", lambda: 2)
 
@@ -34,7 +34,7 @@ def test_kernels_stay_where_every_device_runs_its_own_seeds(two_gpus: None) -> N
     seen = []
 
     def double(x: jax.Array, factor: jax.Array) -> jax.Array:
-        seen.append(sharding.alone_on_gpu(x))
+        seen.append(sharding.pallas_allowed(x))
         return factor * x
 
     x, one = jnp.arange(3.0), sharding.mesh(1, 1)
@@ -46,7 +46,7 @@ def test_kernels_stay_where_every_device_runs_its_own_seeds(two_gpus: None) -> N
 
 
 def test_kernels_are_for_single_precision_on_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not sharding.alone_on_gpu(jnp.zeros(2, jnp.float32)), "a processor"
+    assert not sharding.pallas_allowed(jnp.zeros(2, jnp.float32)), "a processor"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    assert sharding.alone_on_gpu(jnp.zeros(2, jnp.float32))
-    assert not sharding.alone_on_gpu(jnp.zeros(2, jnp.float16))
+    assert sharding.pallas_allowed(jnp.zeros(2, jnp.float32))
+    assert not sharding.pallas_allowed(jnp.zeros(2, jnp.float16))

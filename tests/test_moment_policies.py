@@ -36,7 +36,7 @@ def start(key):
 
 def make(kind, squash="sine"):
     if kind == "rbf":
-        return rbf(**pieces(squash), start=start, waves=2, units=UNITS)
+        return rbf(**pieces(squash), start=start, waves=2, num_centers=UNITS)
     return linear(**pieces(squash), features=F)
 
 
@@ -84,7 +84,7 @@ def test_the_control_is_the_formula(kind, squash, x64):
 
 
 def test_the_rbf_controller_begins_where_episodes_do():
-    policy = rbf(**pieces("sine"), start=start, waves=2, units=4000)
+    policy = rbf(**pieces("sine"), start=start, waves=2, num_centers=4000)
     params = jax.jit(policy.init)(jax.random.key(0))
     centres = np.asarray(params["centres"])
     np.testing.assert_allclose(centres[:, :2].mean(0), [0.5, -1.0], atol=0.03)
@@ -100,9 +100,9 @@ def test_the_rbf_controller_begins_where_episodes_do():
 def test_single_precision_is_enough_for_the_rbf_controller(units):
     """At its start, where its centres are closest and its weights largest.
 
-    The variance is a difference of sums a thousand times as large: by processor and compiler it is .2 to 1.5 % off.
+    The variance is a difference of sums a thousand times as large: by CPU and compiler it is .2 to 1.5 % off.
     """
-    policy = rbf(**pieces("sine"), start=start, waves=2, units=units)
+    policy = rbf(**pieces("sine"), start=start, waves=2, num_centers=units)
     params = policy.init(jax.random.key(0))
     mean, cov = np.array([0.5, -1.0, 0.9, -0.4]), 0.04 * np.eye(F)
     single = jax.jit(policy.moments)(params, jnp.float32(mean), jnp.float32(cov))

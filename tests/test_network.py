@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax.models.networks import ACTIVATIONS, INITIALISERS, MLP
+from pegasus_jax.models.networks import ACTIVATIONS, INITIALIZERS, MLP
 
 
 def forward(params, x, masks):
@@ -37,7 +37,7 @@ def test_every_row_may_have_its_own_mask():
     np.testing.assert_allclose(network.apply(params, x, [None, mask]), rows, atol=1e-6)
 
 
-@pytest.mark.parametrize("name", INITIALISERS)
+@pytest.mark.parametrize("name", INITIALIZERS)
 def test_initial_weights(name):
     """Glorot: variance 2 / (in + out). Orthogonal: the rows or columns are orthonormal. Biases: within .01."""
     params = jax.jit(lambda key: MLP((60,), 40, name).init(key, jnp.zeros(50), [None, None]))(jax.random.key(0))[

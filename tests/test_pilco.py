@@ -66,7 +66,7 @@ def controller():
         start=lambda key: jax.random.normal(key, (D,)),
         waves=2,
         controls=1,
-        units=UNITS,
+        num_centers=UNITS,
         saturate=to_limits(SQUASHES["sine"], low, high),
         saturate_moments=partial(gaussian.squash, low=low, high=high),
     )

@@ -137,7 +137,7 @@ KINDS = {
         start=lambda key: jnp.array([1e4, 0.0, 0.0]) + jax.random.normal(key, (3,)),
         waves=2,
         controls=2,
-        units=10,
+        num_centers=10,
         saturate=jnp.tanh,
         saturate_moments=None,
     ),

@@ -44,7 +44,7 @@ def descent():
 def found(own, others, key=0, calls=1):
     """(learner, info) of a search of 60 iterations in so many calls."""
     fresh = lambda key, given: jax.random.choice(key, jnp.asarray(others))  # noqa: E731
-    searcher = best_of(descent(), fresh, starts=STARTS, window=STEPS // 20)
+    searcher = best_of(descent(), fresh, num_starts=STARTS, window=STEPS // 20)
     learner = Learner(jnp.float32(own), searcher.init(jnp.float32(own)))
     run, info = jax.jit(partial(searcher.run, steps=STEPS // calls)), None
     for call in range(calls):
@@ -92,7 +92,7 @@ def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_
 
     def members(lasting):
         """After a search of 3 iterations, and after one more, with another key."""
-        searcher = best_of(descent(), fresh, starts=STARTS, window=1, lasting=lasting)
+        searcher = best_of(descent(), fresh, num_starts=STARTS, window=1, lasting=lasting)
         learner = Learner(jnp.float32(0.3), searcher.init(jnp.float32(0.3)))
         first, _ = searcher.run(jax.random.key(0), learner, DEEPER, first=0, earlier=0, steps=3)
         second, _ = searcher.run(jax.random.key(1), first, DEEPER, first=0, earlier=1, steps=3)
@@ -109,7 +109,7 @@ def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_
 
 @pytest.mark.slow
 def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():
-    chosen = tiny(trials=2, fit__steps=5, search__steps=4, search__particles=5, search__starts=3)
+    chosen = tiny(trials=2, fit__steps=5, search__steps=4, search__particles=5, search__num_starts=3)
     exp = compose(chosen, cart(), dynamics=regression(2, 1), policy=noisy_linear_policy(cart()))
     state = exp.init(jax.random.key(0))
     after, (_, info) = unchecked(jax.jit(lambda s: exp.improve(exp.add_episode(s, exp.collect(s)))))(state)
@@ -123,5 +123,8 @@ def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():
 
 
 def test_starts_begin_every_search_anew():
-    with pytest.raises(ConfigError, match=r"search\.starts=4 begins every search anew; it needs search\.reset=true"):
-        config.Search(starts=4, reset=False)
+    with pytest.raises(
+        ConfigError,
+        match=r"search\.num_starts=4 begins every search with fresh policies; it needs search\.reset_optimizer=true",
+    ):
+        config.Search(num_starts=4, reset_optimizer=False)

@@ -61,7 +61,7 @@ def test_a_state_of_other_settings_is_refused_with_the_difference(run: Path) -> 
 
 def test_another_optimizer_leaves_what_was_learned(run: Path) -> None:
     _, _, before = restore.restored(run, 2)
-    change(run, search__starts=2, trials=9)
+    change(run, search__num_starts=2, trials=9)
     _, experiment, state = restore.restored(run, 2)
     assert state.policy.optimizer is None
     assert state.model.optimizer is not None

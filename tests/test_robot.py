@@ -54,7 +54,7 @@ class Watched(Arm):
 
 gymnasium.register("Watched-v0", Watched)
 """
-WORDS = ["task=gym", "env=robot:Watched-v0", "cost=robot:cost", "angles=[0]", "start_mean=[3.14,0]", "evaluation=0"]
+WORDS = ["task=gym", "env=robot:Watched-v0", "cost=robot:cost", "angles=[0]", "start_mean=[3.14,0]", "eval_episodes=0"]
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
 PROGRAM = [sys.executable, "-P", "-c"]
 
@@ -208,8 +208,8 @@ def test_facts_that_are_given_are_not_asked_for() -> None:
 
 @pytest.mark.slow
 def test_runs_that_were_not_evaluated_have_no_curves_to_compare(learned: Path) -> None:
-    with pytest.raises(RunError, match="evaluation=0"):
+    with pytest.raises(RunError, match="eval_episodes=0"):
         seeds_picture([learned / "run"], learned / "learning.png")
-    with pytest.raises(ConfigError, match="evaluation=0"):
-        study.study(Config(evaluation=0), [0])
+    with pytest.raises(ConfigError, match="eval_episodes=0"):
+        study.study(Config(eval_episodes=0), [0])
     assert config_io.load(learned / "run" / "config.yaml").start_mean == (3.14, 0.0)

@@ -1,6 +1,5 @@
 """A run's config on disk: what is saved is loaded to the last bit, and a file that is no config says so."""
 
-import re
 from functools import partial
 
 import jax
@@ -9,11 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pegasus_jax import config, config_models
-from pegasus_jax.checks import ConfigError, shown
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
 from pegasus_jax.presets import ALGORITHMS
 from pegasus_jax.runs import config_io
-from pegasus_jax.runs.removed import REMOVED
 from pegasus_jax.tasks import TASKS
 from test_settings import parse
 
@@ -27,31 +25,33 @@ configs = st.builds(
     trials=st.integers(1, 10_000),
     model=st.builds(
         BNN,
-        low=st.floats(-20, -0.1),
+        log_z_min=st.floats(-20, -0.1),
         hidden=layers,
         dropout=st.sampled_from(config_models.DROPOUTS),
         heteroscedastic=st.booleans(),
         weight_decay=st.floats(0, 10),
-        initialiser=st.sampled_from(config.INITIALISERS),
+        initializer=st.sampled_from(config.INITIALIZERS),
     ),
     policy=st.builds(
         MLP,
         hidden=layers,
         dropout=st.floats(0, 0.99),
         squash=st.sampled_from(config.SQUASHES),
-        initialiser=st.sampled_from(config.INITIALISERS),
+        initializer=st.sampled_from(config.INITIALIZERS),
     ),
-    fit=st.builds(Fit, steps=whole(1), batch=whole(1), learning_rate=positive),
+    fit=st.builds(Fit, steps=whole(1), batch_size=whole(1), learning_rate=positive),
     search=st.builds(
         Search,
         steps=whole(1),
         particles=whole(2),
         learning_rate=positive,
-        clip=st.none() | positive,
-        match=st.booleans(),
-        balanced=st.booleans(),
-        aggregate=st.sampled_from(config.AGGREGATES),
-        reset=st.booleans(),
+        grad_clip=st.none() | positive,
+        moment_matching=st.booleans(),
+        standardized_noise=st.booleans(),
+        cost_estimator=st.sampled_from(config.COST_ESTIMATORS),
+        observation_noise=st.sampled_from(config.OBSERVATION_NOISES),
+        init=st.sampled_from(config.INITS[:2]),
+        reset_optimizer=st.booleans(),
         policy_noise=st.floats(0, 10),
         state_noise=st.floats(0, 10),
         period=st.builds(Period, *[whole(0)] * 5),
@@ -97,7 +97,7 @@ def test_a_run_from_before_a_setting_existed_goes_on_with_its_default(tmp_path):
     chosen = parse("search.steps=70", "seed=7")
     config_io.save(chosen, tmp_path / "config.yaml")
     lines = (tmp_path / "config.yaml").read_text().splitlines()
-    older = [line for line in lines if "search.reheat" not in line and "fit.decay" not in line]
+    older = [line for line in lines if "search.warm_restart" not in line and "fit.decay" not in line]
     assert len(older) == len(lines) - 2
     (tmp_path / "config.yaml").write_text("\n".join(older), encoding="utf-8")
     assert config_io.load(tmp_path / "config.yaml") == chosen
@@ -111,26 +111,3 @@ def test_what_was_parsed_survives_the_file(algorithm, tmp_path):
     assert loaded == chosen
     assert hash(loaded) == hash(chosen)
     assert jax.tree.leaves(config_io.override(loaded, {"trials": 20}).trials) == [20]
-
-
-@pytest.mark.parametrize("key", REMOVED)
-def test_a_removed_setting_is_read_at_its_old_default_and_refused_at_another_value(key, tmp_path):
-    """And as a word of a command it is refused with what serves instead."""
-    chosen = parse("model=gp") if key == "model.features" else parse("model=ssgp") if key == "model.points" else parse()
-    path = tmp_path / "config.yaml"
-    config_io.save(chosen, path)
-    today, always = path.read_text(), REMOVED[key].always
-    path.write_text(f"{today}{key}: {shown(always)}\n", encoding="utf-8")
-    assert config_io.load(path) == chosen
-    other = {bool: not always, str: "another", type(None): 3}.get(type(always), 0.25)
-    path.write_text(f"{today}{key}: {shown(other)}\n", encoding="utf-8")
-    with pytest.raises(ConfigError) as refused:
-        config_io.load(path)
-    assert f"{path}: {key}={shown(other)} was removed, only {shown(always)} is left" in str(refused.value)
-    for call in (lambda: parse(f"{key}={shown(always)}"), lambda: config_io.override(chosen, {key: always})):
-        with pytest.raises(ConfigError, match=rf"^{key} was removed; instead: ") as refused:
-            call()
-        assert len(str(refused.value).splitlines()) == 1
-        named = re.findall(r"(\w+\.\w+)=", str(refused.value))
-        assert {*named} <= {*config_io.leaves(Config())}, "what serves instead is there"
-    assert key not in config_io.leaves(chosen)

@@ -89,7 +89,7 @@ def test_balanced_noise_has_the_moments_at_every_step():
         start=lambda key: jax.random.normal(key, (3,)),
         particles=9,
         horizon=4,
-        balanced=True,
+        standardized_noise=True,
     )
     samplers = blocks.sensor, blocks.match, r.blocks.match
 

@@ -59,9 +59,9 @@ def of_steps(column, table):
 
 
 def test_the_width_narrows_geometrically_and_stays():
-    table = search_table(25, widen=4.0, anneal=1)
+    table = search_table(25, cost_width_start=4.0, anneal_trials=1)
     np.testing.assert_allclose(table.cost_width[0, [0, 5, 10, 13, 20]], [4, 4**0.6, 4**0.2, 1, 1])
-    refining = search_table(40, widen=4.0, refine=20)  # by half of the coarse part
+    refining = search_table(40, cost_width_start=4.0, refine=20)  # by half of the coarse part
     np.testing.assert_allclose(of_steps(refining.cost_width, refining)[0, [0, 5, 10, 15]], [4, 2, 1, 1])
 
 
@@ -74,7 +74,7 @@ def test_the_step_size_falls_and_begins_again_where_a_search_refines():
 
 
 def test_annealed_searches_are_one_and_the_last_row_of_factors_serves_all_later_ones():
-    table = search_table(2, widen=4.0, decay=0.2, anneal=2)
+    table = search_table(2, cost_width_start=4.0, decay=0.2, anneal_trials=2)
     np.testing.assert_allclose(table.cost_width, [[4, 2], [1, 1], [1, 1]])
     half = np.sqrt(0.5) / 2
     np.testing.assert_allclose(
@@ -84,9 +84,9 @@ def test_annealed_searches_are_one_and_the_last_row_of_factors_serves_all_later_
 
 
 def test_after_annealed_searches_each_has_its_own_step_size_and_limit():
-    table = search_table(2, decay=0.5, anneal=2, reheat=0.4, loosen=30.0)
+    table = search_table(2, decay=0.5, anneal_trials=2, warm_restart=0.4, warm_limit_factor=30.0)
     np.testing.assert_allclose(table.step_size[2], [0.4, 0.3])
-    np.testing.assert_allclose(table.step_size[:2], search_table(2, decay=0.5, anneal=2).step_size[:2])
+    np.testing.assert_allclose(table.step_size[:2], search_table(2, decay=0.5, anneal_trials=2).step_size[:2])
     assert table.limit.tolist() == [[1, 1], [1, 1], [30, 30]]
 
 
@@ -107,7 +107,7 @@ def test_a_table_can_be_read_without_jax():
         ["evaluate", "current"],
         ["evaluate", "coarse"],
     ]
-    later = search_table(2, decay=0.5, anneal=2)
+    later = search_table(2, decay=0.5, anneal_trials=2)
     assert text(later, 9) == text(later, 2) != text(later, 0)
 
 

@@ -101,7 +101,7 @@ def linear_objective(plant, particles):
         start=lambda key: jax.random.normal(key, plant.mean.shape),
         particles=particles,
         horizon=plant.horizon,
-        balanced=True,
+        standardized_noise=True,
     )._replace(start=balanced_start(plant, particles))
     value = partial(
         objective,
@@ -308,7 +308,7 @@ def test_a_new_search_forgets_the_moments_or_goes_on_with_them():
 
 def test_each_iteration_has_its_width_wherever_the_search_is_cut():
     value = lambda *given: distance(*given[:3]) / given[3].cost_width  # noqa: E731
-    found, learner = on_table(search_table(6, widen=4.0), optax.adam(0.1), value=value)
+    found, learner = on_table(search_table(6, cost_width_start=4.0), optax.adam(0.1), value=value)
     whole, info = found.run(jax.random.key(7), learner, 1.0, steps=6)
     half, _ = found.run(jax.random.key(7), learner, 1.0, steps=2)
     rest, last = found.run(jax.random.key(7), half, 1.0, steps=4, first=2)
@@ -372,7 +372,7 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
         start=lambda key: jax.random.normal(key, (2,)),
         particles=5,
         horizon=4,
-        balanced=False,
+        standardized_noise=False,
     )
     draws = sampler(blocks, Period(start=1, sensor=3))  # redrawn inside a piece and across two
     value = partial(

@@ -83,32 +83,32 @@ def test_the_options_of_another_compiler_are_left_out(monkeypatch: pytest.Monkey
     known = {"xla_backend_optimization_level": 1}
     here = jax.default_backend()
     assert programs.compiler_options({here: other | known}) == known
-    monkeypatch.setitem(programs.BRIEFLY, here, other | known)
+    monkeypatch.setitem(programs.FAST_COMPILE, here, other | known)
     states = unchecked(Program(compose(tiny(), cart()), 1))("init", jax.random.key(0)[None])
     assert int(states.trial[0]) == 0
 
 
 def test_a_gpu_is_told_how_to_run_loops_unless_the_user_says(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The options are ones that the JAX at hand has: its compiler for processors reads them too."""
+    """The options are ones that the JAX at hand has: its compiler for CPUs reads them too."""
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     whole, abreast = "xla_gpu_enable_command_buffer", "xla_gpu_command_buffer_scheduling_mode"
-    assert {*programs.compiler_options(programs.LASTING)} == {whole, abreast}
-    assert {*programs.compiler_options(programs.BRIEFLY)} == {whole, abreast}
+    assert {*programs.compiler_options(programs.FAST_RUN)} == {whole, abreast}
+    assert {*programs.compiler_options(programs.FAST_COMPILE)} == {whole, abreast}
     monkeypatch.setenv("XLA_FLAGS", f"--{whole}=")
-    assert {*programs.compiler_options(programs.LASTING)} == {abreast}
+    assert {*programs.compiler_options(programs.FAST_RUN)} == {abreast}
 
 
 @pytest.mark.slow
 def test_how_it_is_compiled_changes_no_result() -> None:
-    """Graphs of kernels where these tests run on a GPU, wide vectors on a processor. A few steps: rounding grows."""
+    """Graphs of kernels where these tests run on a GPU, wide vectors on a CPU. A few steps: rounding grows."""
     experiment = compose(tiny(), cart())
     given = experiment.add_episode(state := experiment.init(jax.random.key(0)), experiment.collect(state))
     for part in (partial(experiment.fit, steps=10), partial(experiment.search, steps=5)):
         lowered = jax.jit(part).lower(given)
         (given, plainly), (_, as_a_run) = (
             lowered.compile(compiler_options=options)(given)
-            for options in ({}, programs.compiler_options(programs.LASTING) | EMITTERS)
+            for options in ({}, programs.compiler_options(programs.FAST_RUN) | EMITTERS)
         )
         jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4), as_a_run, plainly)
 
@@ -124,7 +124,7 @@ def test_the_cores_of_a_processor_share_the_seeds(study: Path) -> None:
     ("seeds", "particles", "threads"), [(1, 100, 1), (1, 1000, None), (3, 100, None), (1, None, None)]
 )
 def test_one_thread_imagines_few_particles(seeds: int, particles: int | None, threads: int | None) -> None:
-    """As the system counts XLA's threads, in a process of its own; a machine of one processor has one in any case."""
+    """As the system counts XLA's threads, in a process of its own; a machine of one CPU has one in any case."""
     code = f"""
 import pathlib, jax
 from pegasus_jax.runs.programs import share_processors
@@ -167,7 +167,7 @@ def alike(study: Path, other: Path) -> None:
 
 @pytest.mark.slow
 def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_path: Path) -> None:
-    """Four devices made of this processor, two for the seeds and two for the particles; resumed on one device."""
+    """Four devices made of this CPU, two for the seeds and two for the particles; resumed on one device."""
     folder, words = tmp_path / "mesh", [*WORDS, "trials=1", "seeds=2", "mesh=2x2"]
     done = call("train", *words, f"out={folder}", cwd=tmp_path, JAX_NUM_CPU_DEVICES="4")
     assert done.returncode == 0, done.stderr

@@ -20,7 +20,7 @@ def parse(*words):
 
 
 # What the cart-pole's words begin with: all defaults but those of its search.
-CARTPOLE = Config(search=Search(balanced=True, widen=2.0, refine=0.5))
+CARTPOLE = Config(search=Search(standardized_noise=True, cost_width_start=2.0, refine_fraction=0.5))
 
 
 def value(chosen, key):
@@ -47,23 +47,26 @@ SPELLINGS = [
     ("model.dropout=binary", "model.dropout", "binary"),
     ("model.dropout=none", "model.dropout", "none"),
     ("model.kl_weight=.2", "model.kl_weight", 0.2),
-    ("model.low=-4", "model.low", -4.0),
+    ("model.log_z_min=-4", "model.log_z_min", -4.0),
     ("model.heteroscedastic=false", "model.heteroscedastic", False),
     ("policy.dropout=.1", "policy.dropout", 0.1),
     ("policy.dropout=0", "policy.dropout", 0.0),
     ("policy.squash=sine", "policy.squash", "sine"),
     ("fit.steps=500", "fit.steps", 500),
-    ("fit.batch=64", "fit.batch", 64),
+    ("fit.batch_size=64", "fit.batch_size", 64),
     ("fit.learning_rate=1e-3", "fit.learning_rate", 1e-3),
     ("search.steps=200", "search.steps", 200),
     ("search.particles=50", "search.particles", 50),
     ("search.learning_rate=.001", "search.learning_rate", 1e-3),
-    ("search.clip=1", "search.clip", 1.0),
-    ("search.clip=0.5", "search.clip", 0.5),
-    ("search.clip=null", "search.clip", None),
-    ("search.match=false", "search.match", False),
-    ("search.balanced=true", "search.balanced", True),
-    ("search.aggregate=total", "search.aggregate", "total"),
+    ("search.grad_clip=1", "search.grad_clip", 1.0),
+    ("search.grad_clip=0.5", "search.grad_clip", 0.5),
+    ("search.grad_clip=null", "search.grad_clip", None),
+    ("search.moment_matching=false", "search.moment_matching", False),
+    ("search.standardized_noise=true", "search.standardized_noise", True),
+    ("search.cost_estimator=particles", "search.cost_estimator", "particles"),
+    ("search.init=fresh", "search.init", "fresh"),
+    ("search.observation_noise=plant", "search.observation_noise", "plant"),
+    ("x64=true", "x64", True),
     ("search.period.start=5", "search.period.start", 5),
     ("search.period.dynamics=1", "search.period.dynamics", 1),
     ("search.period.policy=2", "search.period.policy", 2),
@@ -98,18 +101,23 @@ def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorith
     for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}):
         assert config_io.parse(words) == config_io.parse({"model": "log_normal", **words})
     swimmer = {"task": "swimmer_corkscrew"}
-    five = config_io.parse({**swimmer, "model": "log_normal", "model.members": "5", "model.kl_weight": "1"})
+    five = config_io.parse({**swimmer, "model": "log_normal", "model.ensemble_size": "5", "model.kl_weight": "1"})
     assert config_io.parse(swimmer) == five
 
 
 def test_what_suits_a_task_best_is_the_least_of_what_is_said():
     """Where a model is named the settings chosen with another do not count; a named policy's own do, and words do."""
     own, named = (config_io.parse({"task": "double_cartpole"} | model) for model in ({}, {"model": "lagrangian"}))
-    assert (own.model.substeps, own.search.anneal, own.search.sensors, own.explore.trials) == (4, 14, "known", 4)
+    assert (own.model.substeps, own.search.anneal_trials, own.search.observation_noise, own.explore.trials) == (
+        4,
+        14,
+        "plant",
+        4,
+    )
     assert (own.model.hidden, own.policy.hidden, own.policy.dropout) == ((32, 32), (50,) * 4, 0)
-    assert (named.model.substeps, named.search.anneal, named.explore.trials) == (2, 1, 2)
-    changed = config_io.parse({"task": "double_cartpole", "policy": "dropout_mlp", "search.anneal": "3"})
-    assert (changed.policy.dropout, changed.search.anneal, changed.model) == (0.1, 3, own.model)
+    assert (named.model.substeps, named.search.anneal_trials, named.explore.trials) == (2, 1, 2)
+    changed = config_io.parse({"task": "double_cartpole", "policy": "dropout_mlp", "search.anneal_trials": "3"})
+    assert (changed.policy.dropout, changed.search.anneal_trials, changed.model) == (0.1, 3, own.model)
     assert config_io.parse({"task": "double_cartpole", "policy": "rbf"}).policy == RBF()
 
 
@@ -126,7 +134,7 @@ def test_every_setting_has_a_spelling():
 def test_the_task_changes_only_what_the_chosen_variant_has():
     """The double cart-pole's networks are deeper; so are an ensemble's, and its members stay."""
     chosen = parse("task=double_cartpole", "model=ensemble")
-    assert (chosen.model.hidden, chosen.model.members, chosen.model.dropout) == ((200,) * 4, 5, "none")
+    assert (chosen.model.hidden, chosen.model.ensemble_size, chosen.model.dropout) == ((200,) * 4, 5, "none")
 
 
 def test_the_iterations_of_lbfgs_are_not_those_a_task_gives_its_minibatches():
@@ -151,11 +159,17 @@ def test_a_stored_kind_that_is_unknown_is_named(section, tmp_path):
 
 def test_a_variant_brings_defaults_that_single_settings_change():
     """In any order on the line."""
-    words = "model=binary", "algorithm=deep_pilco", "search.clip=1", "model.weight_decay=.3", "search.period.match=0"
+    words = (
+        "model=binary",
+        "algorithm=deep_pilco",
+        "search.grad_clip=1",
+        "model.weight_decay=.3",
+        "search.period.match=0",
+    )
     for order in (words, words[::-1]):
         chosen = parse(*order)
         assert chosen.model == BNN(dropout="binary", weight_decay=0.3, activation="relu", kl_weight=1.0)
-        plain = Search(cost="particles", widen=1.0, particles=10, clip=1.0, restart=False)
+        plain = Search(cost_estimator="particles", cost_width_start=1.0, particles=10, grad_clip=1.0, init="previous")
         assert chosen.search == dataclasses.replace(plain, period=Period(1, 1, 1, 1, 0))
 
 
@@ -163,8 +177,15 @@ def test_a_variant_brings_defaults_that_single_settings_change():
 def test_a_cost_of_ones_own_is_matched_and_not_widened(words):
     """docs/decisions/0018; the paper's search follows each particle's, on every task."""
     chosen = parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9").search
-    assert (chosen.cost, chosen.widen, chosen.balanced, chosen.refine) == ("matched", 1, True, 0.5)
-    assert parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9", "algorithm=paper").search.cost == "particles"
+    assert (chosen.cost_estimator, chosen.cost_width_start, chosen.standardized_noise, chosen.refine_fraction) == (
+        "gaussian",
+        1,
+        True,
+        0.5,
+    )
+    assert (
+        parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9", "algorithm=paper").search.cost_estimator == "particles"
+    )
 
 
 def test_the_paper_is_a_variant():
@@ -172,10 +193,10 @@ def test_the_paper_is_a_variant():
     chosen = parse("algorithm=paper")
     assert chosen.search.period == Period(start=1, dynamics=0, policy=0, sensor=0, match=0)
     assert (chosen.model.activation, chosen.model.kl_weight, chosen.fit.learning_rate) == ("relu", 1.0, 1e-4)
-    assert (chosen.search.clip, chosen.search.particles) == (1, 100)
-    assert (chosen.search.cost, chosen.search.widen) == ("particles", 1)
-    assert not chosen.search.reset
-    assert not chosen.search.restart
+    assert (chosen.search.grad_clip, chosen.search.particles) == (1, 100)
+    assert (chosen.search.cost_estimator, chosen.search.cost_width_start) == ("particles", 1)
+    assert not chosen.search.reset_optimizer
+    assert chosen.search.init == "previous"
 
 
 def test_pilco_brings_its_own_search_and_precision():
@@ -184,9 +205,9 @@ def test_pilco_brings_its_own_search_and_precision():
         chosen = parse(*words)
         assert isinstance(chosen.search, Analytic)
         assert chosen.search.steps == Analytic.steps
-        assert chosen.precision == "double"
-    assert parse("policy=rbf").policy == RBF(units=30, squash="sine")
-    assert parse("policy=rbf100").policy == RBF(units=100)
+        assert chosen.x64
+    assert parse("policy=rbf").policy == RBF(num_centers=30, squash="sine")
+    assert parse("policy=rbf100").policy == RBF(num_centers=100)
 
 
 def test_options_are_kept_from_the_settings():
@@ -225,8 +246,8 @@ WRONG = [
     (["trials=true"], ["trials=true is not a whole number"]),
     (["fit.learning_rate=fast"], ["fit.learning_rate=fast is not a number"]),
     (["model.kl_weight={a: 1}"], ["model.kl_weight=", "is not a number"]),
-    (["search.clip=none"], ["search.clip=none is not a number or null"]),
-    (["search.reset=maybe"], ["search.reset=maybe is not true or false"]),
+    (["search.grad_clip=none"], ["search.grad_clip=none is not a number or null"]),
+    (["search.reset_optimizer=maybe"], ["search.reset_optimizer=maybe is not true or false"]),
     (["policy.hidden=50"], ["policy.hidden=50 is not a list of whole numbers", "for example policy.hidden=[200,200]"]),
     (["policy.hidden=[50,wide]"], ["is not a list of whole numbers"]),
     (["policy.hidden=[50.5]"], ["is not a list of whole numbers"]),
@@ -249,10 +270,10 @@ WRONG = [
     (["fit.steps=100000000000000000000"], ["fit.steps=100000000000000000000 is out of range", "nearest is 10000000"]),
     (["search.steps=100000000000000000000"], ["the nearest is 10000000"]),
     (["search.particles=100000000000000000000"], ["the nearest is 1000000"]),
-    (["evaluation=100000000000000000000"], ["the nearest is 100000"]),
-    (["model.members=100000000000000000000"], ["the nearest is 1000"]),
+    (["eval_episodes=100000000000000000000"], ["the nearest is 100000"]),
+    (["model.ensemble_size=100000000000000000000"], ["the nearest is 1000"]),
     (["model.hidden=[100000000000000000000]"], ["the nearest is 100000"]),
-    (["policy=rbf", "policy.units=100000000000000000000"], ["the nearest is 100000"]),
+    (["policy=rbf", "policy.num_centers=100000000000000000000"], ["the nearest is 100000"]),
     (["explore.trials=100000000000000000000"], ["the nearest is 10000"]),
     (["task=gym", "horizon=100000", "trials=9999"], ["trials=9999 of horizon=100000", "the nearest is trials=100"]),
     # lists
@@ -274,17 +295,20 @@ WRONG = [
     (["policy.dropout=1.5"], ["policy.dropout=1.5 is out of range", "the nearest is 0.99"]),
     (["policy.hidden=[50,0]"], ["policy.hidden", "the nearest is 1"]),
     (["search.particles=1"], ["search.particles=1", "the nearest is 2"]),
-    (["search.clip=0"], ["search.clip=0 is out of range", "(0, inf)"]),
-    (["search.clip=.inf"], ["search.clip=inf is out of range"]),
+    (["search.grad_clip=0"], ["search.grad_clip=0 is out of range", "(0, inf)"]),
+    (["search.grad_clip=.inf"], ["search.grad_clip=inf is out of range"]),
     (["search.period.match=-1"], ["search.period.match=-1", "the nearest is 0"]),
-    (["search.cost=mached"], ["search.cost=mached is not a choice", "did you mean 'matched'?"]),
-    (["policy=rbf", "policy.units=0"], ["policy.units=0 is out of range", "the nearest is 1"]),
-    (["policy=linear", "policy.units=9"], ["policy.units is not a setting"]),
-    (["algorithm=pilco", "search.clip=1"], ["search.clip is not a setting"]),
+    (
+        ["search.cost_estimator=mached"],
+        ["search.cost_estimator=mached is not a choice", "choices: gaussian, particles"],
+    ),
+    (["policy=rbf", "policy.num_centers=0"], ["policy.num_centers=0 is out of range", "the nearest is 1"]),
+    (["policy=linear", "policy.num_centers=9"], ["policy.num_centers is not a setting"]),
+    (["algorithm=pilco", "search.grad_clip=1"], ["search.grad_clip is not a setting"]),
     (["model.dropout=lognormal"], ["model.dropout=lognormal is not a choice", "did you mean 'log_normal'?"]),
     (["policy.squash=tan"], ["did you mean 'tanh'?", "choices: tanh, sine"]),
-    (["model.low=1"], ["model.low=1 is out of range; expected a number in (-inf, 0)"]),
-    (["model.low=-.inf"], ["model.low=-inf"]),
+    (["model.log_z_min=1"], ["model.log_z_min=1 is out of range; expected a number in (-inf, 0)"]),
+    (["model.log_z_min=-.inf"], ["model.log_z_min=-inf"]),
     (["fit.learning_rate=.nan"], ["fit.learning_rate=nan is out of range"]),
 ]
 
@@ -319,7 +343,7 @@ NESTED += ["2026-01-01", "0x10", "1_0", "first\nsecond"]
 
 
 @pytest.mark.parametrize(
-    "key", ["seed", "model.hidden", "model.dropout", "model.kl_weight", "search.clip", "search.reset"]
+    "key", ["seed", "model.hidden", "model.dropout", "model.kl_weight", "search.grad_clip", "search.reset_optimizer"]
 )
 @pytest.mark.parametrize("text", NESTED)
 def test_any_yaml_ends_in_a_config_or_in_one_line(key, text):
@@ -330,9 +354,9 @@ def test_any_yaml_ends_in_a_config_or_in_one_line(key, text):
 # Settings that are each possible and not together with what the pieces can do: before anything is written, one line
 
 TOGETHER = [
-    ["model.low=-.01"],  # narrower than the least scale of its noise
+    ["model.log_z_min=-.01"],  # narrower than the least scale of its noise
     ["search.particles=2"],
-    ["search.particles=2", "search.match=false", "search.balanced=true"],
+    ["search.particles=2", "search.moment_matching=false", "search.standardized_noise=true"],
     ["policy=rbf", "algorithm=pilco"],
 ]
 
@@ -345,8 +369,10 @@ def test_settings_that_no_piece_can_obey_end_in_one_line_too(words):
     assert words[-1].partition("=")[0].split(".")[-1] in str(caught.value) or "particles" in str(caught.value)
 
 
-@pytest.mark.parametrize("words", [["search.anew=true", "search.refine=1"], ["search.refine=1", "search.anew=true"]])
+@pytest.mark.parametrize(
+    "words", [["search.init=fresh", "search.refine_fraction=1"], ["search.refine_fraction=1", "search.init=fresh"]]
+)
 def test_settings_that_need_each_other_are_changed_together(words):
     """In either order; the first alone is impossible beside the paper's defaults."""
-    chosen = parse("algorithm=paper", "search.restart=true", *words)
-    assert (chosen.search.anew, chosen.search.refine) == (True, 1)
+    chosen = parse("algorithm=paper", "search.init=better", *words)
+    assert (chosen.search.init, chosen.search.refine_fraction) == ("fresh", 1)

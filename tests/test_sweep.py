@@ -50,14 +50,14 @@ def test_what_is_joined_by_commas_is_split_there(found: list[str]) -> None:
 
 
 def test_every_combination_has_its_own_run() -> None:
-    words = {"task": "cartpole", "search.clip": "1,10", "policy.hidden": "[5,5],[7]", "seed": "0-1"}
+    words = {"task": "cartpole", "search.grad_clip": "1,10", "policy.hidden": "[5,5],[7]", "seed": "0-1"}
     jobs = jobs_of(words, Path("out"))
     told = [config_io.split(job.words, ("out",)) for job in jobs]
     assert [options["out"] for options, _ in told] == [str(job.run) for job in jobs]
     assert len({job.run for job in jobs}) == 8
     combinations = itertools.product(("1", "10"), ("[5,5]", "[7]"), ("0", "1"))
     assert [tuple(chosen.values())[1:] for _, chosen in told] == list(combinations)
-    assert jobs[1].run == Path("out/search.clip-1_policy.hidden-5-5/seed1")
+    assert jobs[1].run == Path("out/search.grad_clip-1_policy.hidden-5-5/seed1")
 
 
 def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
@@ -80,9 +80,9 @@ def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
         (["seed=0-99999999"], "0-99999999 is a range of more than 10,000 numbers"),
         (["seed=0-999", "trials=1-999"], "999,000 combinations; a sweep has at most 10,000"),
         (["seeds=99999999999999999999"], "the nearest is 10000"),
-        (["search.clip=1,x"], "search.clip=x is not a number"),
+        (["search.grad_clip=1,x"], "search.grad_clip=x is not a number"),
         (["search.particles=3,100"], "search.particles=3 is too few"),
-        (["search.clip=1", "clipp=2"], "clipp is not a setting"),
+        (["search.grad_clip=1", "clipp=2"], "clipp is not a setting"),
         (["seeds=1,2"], "seeds=1,2 is not a whole number"),
         (["jobs=0"], "jobs=0 is not a whole number"),
         (["launcher=slrm"], "did you mean 'slurm'"),
@@ -97,7 +97,7 @@ def test_what_cannot_be_is_said_before_anything_starts(words: list[str], message
 
 
 def test_a_mistake_is_one_line(tmp_path: Path) -> None:
-    done = call("task=cartpole", "search.clip=1,x", "launcher=local", cwd=tmp_path)
+    done = call("task=cartpole", "search.grad_clip=1,x", "launcher=local", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
     assert not list(tmp_path.iterdir())
 

@@ -266,7 +266,7 @@ def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:
 def test_a_run_goes_on_with_another_search(whole: Path, tmp_path: Path) -> None:
     """Also with one whose optimizer remembers more; what was learned and written before stays as it is."""
     run = copy_until(whole, tmp_path / "run", 9)
-    done = call("train", f"resume={run}", "trials=4", "search.steps=3", "search.starts=2", cwd=tmp_path)
+    done = call("train", f"resume={run}", "trials=4", "search.steps=3", "search.num_starts=2", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "not usable" not in done.stderr
     rows = store.trials(run)
@@ -275,9 +275,9 @@ def test_a_run_goes_on_with_another_search(whole: Path, tmp_path: Path) -> None:
     assert np.isfinite(rows[3]["objective_last"])
     about = json.loads((run / "run.json").read_text())
     assert [command["done"] for command in about["commands"]] == [0, 3]
-    assert "search.starts=2" in about["commands"][1]["command"]
+    assert "search.num_starts=2" in about["commands"][1]["command"]
     now = config_io.leaves(config_io.load(run / "config.yaml"))
-    assert (now["search.steps"], now["search.starts"]) == (3, 2)
+    assert (now["search.steps"], now["search.num_starts"]) == (3, 2)
 
 
 def test_two_processes_cannot_write_to_one_run(whole: Path, tmp_path: Path) -> None:
@@ -339,8 +339,10 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(whole: Path) -> None:
 def test_help_shows_the_settings_that_the_words_beside_it_leave(tmp_path: Path) -> None:
     shown = {words: call("train", "--help", *words.split(), cwd=tmp_path) for words in ("", "task=gym policy=rbf")}
     own, guest = (done.stdout for done in shown.values())
-    assert all(text in own for text in ("search.widen=2 ", "model.substeps=1 ", "with policy.kind=rbf"))
-    assert all(text in guest for text in ("search.widen=1 ", "policy.units=30 ", "with policy.kind=mlp"))
+    assert all(text in own for text in ("search.cost_width_start=2 ", "model.substeps=1 ", "with policy.kind=rbf"))
+    assert all(
+        text in guest for text in ("search.cost_width_start=1 ", "policy.num_centers=30 ", "with policy.kind=mlp")
+    )
     wrong = call("train", "--help", "task=gim", cwd=tmp_path)
     assert (wrong.returncode, wrong.stdout) == (2, "")
     assert "did you mean 'gym'" in wrong.stderr

@@ -180,7 +180,7 @@ def test_forgetting_adams_moments_or_not(watched, looped):
     assert same(watched.search(state)[0], watched.search(forgot)[0]._replace(model=state.model))
     assert not same(watched.fit(state)[0].model.params, watched.fit(forgot)[0].model.params)
     pieces = dict(dynamics=watched.exp.dynamics, policy=watched.exp.policy)
-    other = compose(tiny(**QUICK, search__reset=False), watched.exp.task, **pieces)
+    other = compose(tiny(**QUICK, search__reset_optimizer=False), watched.exp.task, **pieces)
     search = jax.jit(other.search)
     assert not same(search(state)[0].policy.params, search(forgot)[0].policy.params)
 
@@ -227,7 +227,7 @@ def test_no_two_purposes_trials_or_iterations_share_a_key():
 
     task = cart(horizon=3)
     config = tiny(
-        **{**QUICK, "fit__steps": 4, "search__steps": 3}, search__restart=False, search__period=Period(1, 1, 1, 1, 1)
+        **{**QUICK, "fit__steps": 4, "search__steps": 3}, search__init="previous", search__period=Period(1, 1, 1, 1, 1)
     )
     dynamics, policy = regression(2, 1), noisy_linear_policy(task)
     exp = compose(
@@ -292,7 +292,7 @@ def test_a_search_starts_from_the_better_of_the_old_policy_and_a_fresh_one(offse
         sample=lambda key, posterior: (),
         apply=lambda posterior, draw, x, u: Prediction(jnp.broadcast_to(u, (2,)), jnp.zeros(2)),
     )
-    config = tiny(search__steps=1, search__learning_rate=1e-12, search__match=False)
+    config = tiny(search__steps=1, search__learning_rate=1e-12, search__moment_matching=False)
     exp = compose(config, task, dynamics=jump, policy=towards)
     state = jax.jit(exp.init)(jax.random.key(0))
     old = {"aim": jnp.full(2, 1.0 + offset)}

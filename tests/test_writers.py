@@ -17,12 +17,12 @@ from pegasus_jax.runs.job import Job, first_states
 from pegasus_jax.runs.programs import Program
 from pegasus_jax.runs.train import learn
 from pegasus_jax.runs.writers import Writer
-from pegasus_jax.studies.study import one_json, short
+from pegasus_jax.studies.study import one_json, rounded
 from pegasus_jax.types import Episode, RunState, Trajectory
 from probes import cart, same, tiny, unchecked
 
 SEEDS, TRIALS = [5, 6], 2
-CONFIG = tiny(trials=TRIALS, evaluation=3, fit__steps=20, search__steps=10)
+CONFIG = tiny(trials=TRIALS, eval_episodes=3, fit__steps=20, search__steps=10)
 
 
 @pytest.fixture(scope="module")
@@ -67,7 +67,7 @@ def test_a_study_keeps_the_rows_of_the_folders(job: Job, unwritten: RunState, tm
     assert [np.shape(result["mean_cost"]) for result in handed] == [(2, 1), (2, 2)]
     for name in ("mean_cost", "episode_cost", "objective_last", "objective_fresh", "saturated", "calibration"):
         columns = [[np.nan if row[name] is None else row[name] for row in seed] for seed in rows]
-        assert handed[-1][name] == short(columns), name
+        assert handed[-1][name] == rounded(columns), name
     assert handed[-1]["success_rate"] == [[row["success_rate"] for row in seed] for seed in rows]
     assert handed[-1]["seeds"] == SEEDS
     assert handed[-1]["config"]["search.steps"] == 10

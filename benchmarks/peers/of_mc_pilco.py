@@ -49,9 +49,9 @@ SETTINGS = {
     "model": "gp",
     "policy": "rbf",
     "policy.squash": "tanh",
-    "search.match": "false",
-    "search.cost": "particles",
-    "search.widen": "1",
+    "search.moment_matching": "false",
+    "search.cost_estimator": "particles",
+    "search.cost_width_start": "1",
     "trials": str(EPISODES),
 }
 

@@ -12,15 +12,15 @@ from typing import Any, get_args, get_origin
 SIZES = {
     "steps": 10**7,
     "particles": 10**6,
-    "batch": 10**6,
+    "batch_size": 10**6,
     "hidden": 10**5,
-    "units": 10**5,
-    "starts": 10**4,
-    "members": 10**3,
+    "num_centers": 10**5,
+    "num_starts": 10**4,
+    "ensemble_size": 10**3,
     "substeps": 10**3,
-    "anneal": 10**4,
+    "anneal_trials": 10**4,
     "horizon": 10**5,
-    "evaluation": 10**5,
+    "eval_episodes": 10**5,
     "trials": 10**4,
     "rows": 10**7,
     "dt": 10**4,
@@ -35,7 +35,7 @@ class RunError(Exception):
     """A run's folder is not as it should be; the message is one line for the person who named it."""
 
 
-def nearest(name: str, choices: Iterable[str]) -> str:
+def did_you_mean(name: str, choices: Iterable[str]) -> str:
     """The end of an error message: the nearest valid choice, and all of them."""
     choices = [str(c) for c in choices]
     close = difflib.get_close_matches(str(name), choices, n=1, cutoff=0.4)
@@ -46,10 +46,10 @@ def nearest(name: str, choices: Iterable[str]) -> str:
 def choice(name: str, value: Any, choices: Iterable[Any]) -> None:
     """Raises ConfigError unless the value is one of the choices."""
     if value not in tuple(choices):
-        raise ConfigError(f"{name}={value} is not a choice; {nearest(value, choices)}")
+        raise ConfigError(f"{name}={value} is not a choice; {did_you_mean(value, choices)}")
 
 
-def within(
+def check_range(
     name: str, value: float, low: float, high: float = math.inf, *, open_low: bool = False, open_high: bool = False
 ) -> None:
     """Raises ConfigError unless the value is finite and from low to high, an end that is open left out."""
@@ -63,10 +63,10 @@ def within(
         raise ConfigError(f"{name}={number(value)} is out of range; expected a number in {interval}{hint}")
 
 
-def least(section: str, config: Any, low: float, *names: str) -> None:
+def check_minimum(section: str, config: Any, low: float, *names: str) -> None:
     """Raises ConfigError unless each of these settings of a section is at least `low`."""
     for name in names:
-        within(f"{section}.{name}", getattr(config, name), low)
+        check_range(f"{section}.{name}", getattr(config, name), low)
 
 
 def number(value: float) -> str:
@@ -76,7 +76,7 @@ def number(value: float) -> str:
 
 def size(name: str, value: int, low: int = 1) -> None:
     """Raises ConfigError unless a size, the last part of the setting's name in SIZES, is at least `low` and sane."""
-    within(name, value, low, SIZES[name.rpartition(".")[2]])
+    check_range(name, value, low, SIZES[name.rpartition(".")[2]])
 
 
 def sizes(section: str, config: Any, *names: str, low: int = 1) -> None:
@@ -98,8 +98,8 @@ def rows(trials: int, horizon: int | None) -> None:
 def layers(name: str, widths: tuple[int, ...]) -> None:
     """Raises ConfigError unless these are widths of hidden layers."""
     for width in widths:
-        within(name, width, 1, SIZES["hidden"])
-    within(f"number of {name}", len(widths), 0, 100)
+        check_range(name, width, 1, SIZES["hidden"])
+    check_range(f"number of {name}", len(widths), 0, 100)
 
 
 def finite(name: str, values: Iterable[float]) -> None:
@@ -197,5 +197,5 @@ def whole(name: str, text: str) -> int:
     """The whole number of an option. Raises ConfigError when it is none, or 0 where nothing would be done."""
     if not text.isdecimal() or (name in ("episodes", "seeds", "jobs") and int(text) < 1):
         raise ConfigError(f"{name}={text} is not a whole number; for example {name}=20")
-    within(name, int(text), 0, 2**32 - 1 if name == "seed" else SIZES["trials"])
+    check_range(name, int(text), 0, 2**32 - 1 if name == "seed" else SIZES["trials"])
     return int(text)

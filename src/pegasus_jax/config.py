@@ -10,7 +10,7 @@ from typing import Any
 
 from pegasus_jax import checks
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.config_models import BNN, GP, INITIALISERS, SSGP, Lagrangian, setting
+from pegasus_jax.config_models import BNN, GP, INITIALIZERS, SSGP, Lagrangian, setting
 
 MANEUVERS = ("knife_edge", "belly_up", "corkscrew", "depth_change")
 GYM = "gym"  # the task that `env=` and `cost=` describe
@@ -20,11 +20,10 @@ OWN = (GYM, MJCF)
 
 SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
-AGGREGATES = ("mean", "total")
-COSTS = ("particles", "matched")
-SENSORS = ("predicted", "known")
+COST_ESTIMATORS = ("gaussian", "particles")
+OBSERVATION_NOISES = ("model", "plant")
+INITS = ("previous", "better", "fresh")
 LEGS = (2, 6)
-PRECISIONS = ("single", "double")
 SUCCESSORS = ("always", "better")
 
 
@@ -39,17 +38,17 @@ class MLP:
     input_units: tuple[float, ...] = setting(
         (), "unit of each state that is not an angle, one number each; []: the plant's units"
     )
-    initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
+    initializer: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
         checks.typed("policy", self)
         checks.kind("policy", self.kind, "mlp")
         checks.layers("policy.hidden", self.hidden)
-        for name, choices in (("squash", SQUASHES), ("initialiser", INITIALISERS)):
+        for name, choices in (("squash", SQUASHES), ("initializer", INITIALIZERS)):
             checks.choice(f"policy.{name}", getattr(self, name), choices)
-        checks.within("policy.dropout", self.dropout, 0, 0.99)
+        checks.check_range("policy.dropout", self.dropout, 0, 0.99)
         for unit in self.input_units:
-            checks.within("policy.input_units", unit, 0, open_low=True)
+            checks.check_range("policy.input_units", unit, 0, open_low=True)
 
 
 @dataclass(frozen=True)
@@ -57,13 +56,13 @@ class RBF:
     """A controller of radial basis functions: the mean of a Gaussian process, PILCO's."""
 
     kind: str = setting("rbf", "")
-    units: int = setting(30, "radial basis functions")
+    num_centers: int = setting(30, "radial basis functions")
     squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
 
     def __post_init__(self) -> None:
         checks.typed("policy", self)
         checks.kind("policy", self.kind, "rbf")
-        checks.size("policy.units", self.units)
+        checks.size("policy.num_centers", self.num_centers)
         checks.choice("policy.squash", self.squash, SQUASHES)
 
 
@@ -86,16 +85,16 @@ class Fit:
 
     kind: str = setting("adam", "")
     steps: int = setting(2000, "updates a trial")
-    batch: int = setting(100, "rows an update")
+    batch_size: int = setting(100, "rows an update")
     learning_rate: float = setting(3e-4, "Adam's step size")
     decay: float = setting(1.0, "step size at the end of a fit, as a fraction of that at its start")
 
     def __post_init__(self) -> None:
         checks.typed("fit", self)
         checks.kind("fit", self.kind, "adam")
-        checks.sizes("fit", self, "steps", "batch")
-        checks.within("fit.learning_rate", self.learning_rate, 0, open_low=True)
-        checks.within("fit.decay", self.decay, 0, 1)
+        checks.sizes("fit", self, "steps", "batch_size")
+        checks.check_range("fit.learning_rate", self.learning_rate, 0, open_low=True)
+        checks.check_range("fit.decay", self.decay, 0, 1)
 
 
 @dataclass(frozen=True)
@@ -104,12 +103,12 @@ class LBFGS:
 
     kind: str = setting("lbfgs", "")
     steps: int = setting(300, "iterations a trial, at most")
-    starts: int = setting(100, "fresh parameters, of which the best, or the current ones, begin")
+    num_starts: int = setting(100, "fresh parameters, of which the best, or the current ones, begin")
 
     def __post_init__(self) -> None:
         checks.typed("fit", self)
         checks.kind("fit", self.kind, "lbfgs")
-        checks.sizes("fit", self, "steps", "starts")
+        checks.sizes("fit", self, "steps", "num_starts")
 
 
 @dataclass(frozen=True)
@@ -125,7 +124,7 @@ class Period:
     def __post_init__(self) -> None:
         checks.typed("search.period", self)
         for f in dataclasses.fields(self):
-            checks.within(f"search.period.{f.name}", getattr(self, f.name), 0)
+            checks.check_range(f"search.period.{f.name}", getattr(self, f.name), 0)
 
 
 @dataclass(frozen=True)
@@ -137,35 +136,38 @@ class Search:
     particles: int = setting(100, "K, imagined rollouts an iteration")
     learning_rate: float = setting(1e-3, "Adam's step size")
     decay: float = setting(1.0, "step size at the end of a search, as a fraction of that at its start")
-    clip: float | None = setting(1.0, "largest global norm of the gradient; null: no clipping")
-    match: bool = setting(True, "moment matching")
-    balanced: bool = setting(False, "make the drawn noise exactly zero mean, unit covariance over the particles")
-    aggregate: str = setting("mean", "over the horizon: mean (authors' code) or total (the paper's sum)")
-    cost: str = setting(
-        "matched", "matched: expected cost of the matched Gaussian; particles: mean cost of the particles"
+    grad_clip: float | None = setting(1.0, "largest global norm of the gradient; null: no clipping")
+    moment_matching: bool = setting(True, "moment matching")
+    standardized_noise: bool = setting(
+        False, "make the drawn noise exactly zero mean, unit covariance over the particles"
     )
-    refine: float = setting(
+    cost_estimator: str = setting(
+        "gaussian", "gaussian: expected cost of the matched Gaussian; particles: mean cost of the particles"
+    )
+    refine_fraction: float = setting(
         0.0, "last part of a search, as a fraction, which refines the better of the new policy and the old one"
     )
-    widen: float = setting(4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it")
-    anneal: int = setting(1, "trials over which widen= and decay= run down once; 1: in every search")
-    limit: float | None = setting(
+    cost_width_start: float = setting(
+        4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it"
+    )
+    anneal_trials: int = setting(1, "trials over which cost_width_start= and decay= run down once; 1: in every search")
+    particle_grad_limit: float | None = setting(
         None, "drop a particle's gradient with respect to its state where it is longer; null: never"
     )
-    reheat: float = setting(
-        0.0, "after `anneal` trials: step size at the start of each search, as a fraction; 0: constant"
+    warm_restart: float = setting(
+        0.0, "after `anneal_trials`: step size at the start of each search, as a fraction; 0: constant"
     )
-    loosen: float = setting(1.0, "factor of the limit in the searches that are reheated")
-    reset: bool = setting(True, "forget Adam's moments at each trial")
-    restart: bool = setting(
-        True, "start from a fresh policy if it costs less than the old one, or the last search found nothing better"
+    warm_limit_factor: float = setting(1.0, "factor of particle_grad_limit in the searches that warm_restart begins")
+    reset_optimizer: bool = setting(True, "forget Adam's moments at each trial")
+    init: str = setting(
+        "better",
+        "what a search starts from: the previous policy, a fresh one, or the better of both",
     )
-    anew: bool = setting(
-        False, "start every search from a fresh policy; the old one is refined if none better is found"
+    num_starts: int = setting(
+        1, "policies searched side by side, the best of which goes on: the old one and fresh ones"
     )
-    starts: int = setting(1, "policies searched side by side, the best of which goes on: the old one and fresh ones")
-    sensors: str = setting(
-        "predicted", "noise on what the policy sees: predicted (by the model) or known (the plant's)"
+    observation_noise: str = setting(
+        "model", "whose noise is on what the policy sees: the model's prediction, or the plant's, where it is known"
     )
     policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
@@ -174,34 +176,38 @@ class Search:
     def __post_init__(self) -> None:
         checks.typed("search", self)
         checks.kind("search", self.kind, "particles")
-        checks.least("search", self, 0, "policy_noise", "state_noise")
-        checks.least("search", self, 1, "widen", "loosen")
-        checks.sizes("search", self, "steps", "anneal", "starts")
+        checks.check_minimum("search", self, 0, "policy_noise", "state_noise")
+        checks.check_minimum("search", self, 1, "cost_width_start", "warm_limit_factor")
+        checks.sizes("search", self, "steps", "anneal_trials", "num_starts")
         checks.sizes("search", self, "particles", low=2)
-        checks.within("search.learning_rate", self.learning_rate, 0, open_low=True)
-        checks.within("search.decay", self.decay, 0, 1)
-        checks.within("search.reheat", self.reheat, 0, 1)
-        for name, choices in (("aggregate", AGGREGATES), ("cost", COSTS), ("sensors", SENSORS)):
-            checks.choice(f"search.{name}", getattr(self, name), choices)
-        checks.within("search.refine", self.refine, 0, 1)
-        for name, value in (("clip", self.clip), ("limit", self.limit)):
-            if value is not None:
-                checks.within(f"search.{name}", value, 0, open_low=True)
-        if self.reheat and (self.anneal == 1 or self.decay == 1):
+        checks.check_range("search.learning_rate", self.learning_rate, 0, open_low=True)
+        for name in ("decay", "warm_restart", "refine_fraction"):
+            checks.check_range(f"search.{name}", getattr(self, name), 0, 1)
+        checks.choice("search.cost_estimator", self.cost_estimator, COST_ESTIMATORS)
+        checks.choice("search.observation_noise", self.observation_noise, OBSERVATION_NOISES)
+        checks.choice("search.init", self.init, INITS)
+        for name in ("grad_clip", "particle_grad_limit"):
+            if (value := getattr(self, name)) is not None:
+                checks.check_range(f"search.{name}", value, 0, open_low=True)
+        if self.warm_restart and (self.anneal_trials == 1 or self.decay == 1):
             raise ConfigError(
-                f"search.reheat={self.reheat:g} needs searches that cool, search.anneal=10 search.decay=0.1;"
-                " the nearest is 0"
+                f"search.warm_restart={self.warm_restart:g} needs searches that cool, search.anneal_trials=10"
+                " search.decay=0.1; the nearest is 0"
             )
-        if self.loosen > 1 and (self.limit is None or not self.reheat):
+        if self.warm_limit_factor > 1 and (self.particle_grad_limit is None or not self.warm_restart):
             raise ConfigError(
-                f"search.loosen={self.loosen:g} needs search.limit=1 search.reheat=0.3, or the like; the nearest is 1"
+                f"search.warm_limit_factor={self.warm_limit_factor:g} needs search.particle_grad_limit=1"
+                " search.warm_restart=0.3, or the like; the nearest is 1"
             )
-        if self.anneal > 1 and self.refine:
-            raise ConfigError(f"search.anneal={self.anneal} needs search.refine=0")
-        if self.anew and not (self.restart and self.refine):
-            raise ConfigError("search.anew=true needs search.restart=true search.refine=0.5; the nearest is false")
-        if self.starts > 1 and not self.reset:
-            raise ConfigError(f"search.starts={self.starts} begins every search anew; it needs search.reset=true")
+        if self.anneal_trials > 1 and self.refine_fraction:
+            raise ConfigError(f"search.anneal_trials={self.anneal_trials} needs search.refine_fraction=0")
+        if self.init == "fresh" and not self.refine_fraction:
+            raise ConfigError("search.init=fresh needs search.refine_fraction=0.5; the nearest is better")
+        if self.num_starts > 1 and not self.reset_optimizer:
+            raise ConfigError(
+                f"search.num_starts={self.num_starts} begins every search with fresh policies; it needs"
+                " search.reset_optimizer=true"
+            )
 
 
 @dataclass(frozen=True)
@@ -211,19 +217,18 @@ class Analytic:
     kind: str = setting("analytic", "")
     steps: int = setting(300, "iterations of L-BFGS a trial, at most")
     particles: int = setting(100, "K, rollouts imagined afterwards for the record; the search has none")
-    aggregate: str = setting("mean", "over the horizon: mean, or total, PILCO's sum")
-    restart: bool = setting(True, "start a search from a fresh policy when it expects a lower cost than the old one")
+    init: str = setting("better", "what a search starts from: the previous policy, or the better of it and a fresh one")
     policy_noise: float = setting(1.0, "factor of the model's noise on what the policy sees")
     state_noise: float = setting(1.0, "factor of the model's noise added to the state")
-    reset, anneal, sensors = True, 1, "predicted"  # no settings: curvature is that of one model
+    reset_optimizer, anneal_trials, observation_noise = True, 1, "model"  # no settings: curvature is of one model
 
     def __post_init__(self) -> None:
         checks.typed("search", self)
         checks.kind("search", self.kind, "analytic")
-        checks.least("search", self, 0, "policy_noise", "state_noise")
+        checks.check_minimum("search", self, 0, "policy_noise", "state_noise")
         checks.sizes("search", self, "steps")
         checks.sizes("search", self, "particles", low=2)
-        checks.choice("search.aggregate", self.aggregate, AGGREGATES)
+        checks.choice("search.init", self.init, INITS[:2])
 
 
 @dataclass(frozen=True)
@@ -247,6 +252,19 @@ class Config:
     """One run."""
 
     task: str = setting("cartpole", "what to learn")
+    seed: int = setting(0, "all randomness of the run comes from it")
+    trials: int = setting(15, "episodes on the plant, the random ones included")
+    eval_episodes: int = setting(20, "episodes after each trial that only measure the policy; 0: none, as for a robot")
+    successor: str = setting(
+        "always", "which policy runs next: always the new one, or the better one as expected under the new model"
+    )
+    x64: bool = setting(False, "numbers of 64 bits, not 32")
+    model: Model = BNN()  # noqa: RUF009 (frozen)
+    policy: MLP | RBF | Linear = MLP()
+    fit: Fit | LBFGS = Fit()
+    search: Search | Analytic = Search()
+    explore: Explore = Explore()
+    # The plant, where the task leaves it to you: of a gym's or an mjcf's task, and a swimmer's legs.
     legs: int = setting(2, "that the swimmer drives: 2 or 6", ("swimmer_*",))
     env: str | None = setting(None, "the environment's Gymnasium id", (GYM,))
     mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", (MJCF,))
@@ -280,25 +298,12 @@ class Config:
         (), "observations where episodes start, equally likely; []: 100 resets, or as start_mean says", (GYM,)
     )
     success: float = setting(0.2, "the mean cost of an episode's last five steps is less than this", OWN)
-    seed: int = setting(0, "all randomness of the run comes from it")
-    trials: int = setting(15, "episodes on the plant, the random ones included")
-    evaluation: int = setting(20, "episodes after each trial that only measure the policy; 0: none, as for a robot")
-    successor: str = setting(
-        "always", "which policy runs next: always the new one, or the better one as expected under the new model"
-    )
-    precision: str = setting("single", "of all numbers: single (32 bits) or double (64)")
-    model: Model = BNN()  # noqa: RUF009 (frozen)
-    policy: MLP | RBF | Linear = MLP()
-    fit: Fit | LBFGS = Fit()
-    search: Search | Analytic = Search()
-    explore: Explore = Explore()
 
     def __post_init__(self) -> None:
         checks.typed("", self)
         checks.choice("legs", self.legs, LEGS)
-        checks.choice("precision", self.precision, PRECISIONS)
         checks.choice("successor", self.successor, SUCCESSORS)
-        checks.within("stop_cost", self.stop_cost, 0)
+        checks.check_range("stop_cost", self.stop_cost, 0)
         for name in ("env_args", "angles", "rates", "observe"):
             checks.different(name, getattr(self, name))
         for name in ("control_low", "control_high", "start_mean"):
@@ -307,15 +312,15 @@ class Config:
             checks.finite("starts", row)
         checks.pairs("circles", self.circles or ())
         for deviation in self.start_std:
-            checks.within("start_std", deviation, 0)
-        checks.within("success", self.success, 0, open_low=True)
+            checks.check_range("start_std", deviation, 0)
+        checks.check_range("success", self.success, 0, open_low=True)
         if self.dt is not None:
-            checks.within("dt", self.dt, 0, checks.SIZES["dt"], open_low=True)
+            checks.check_range("dt", self.dt, 0, checks.SIZES["dt"], open_low=True)
         if self.horizon is not None:
             checks.size("horizon", self.horizon)
-        checks.within("seed", self.seed, 0, 2**32 - 1)
+        checks.check_range("seed", self.seed, 0, 2**32 - 1)
         checks.sizes("", self, "trials")
-        checks.sizes("", self, "evaluation", low=0)
+        checks.sizes("", self, "eval_episodes", low=0)
         checks.rows(self.trials, self.horizon)
 
 

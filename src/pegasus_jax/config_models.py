@@ -14,7 +14,7 @@ def setting(default: Any, text: str, of: tuple[str, ...] = ()) -> Any:
 
 DROPOUTS = ("log_normal", "binary", "concrete", "gaussian", "sparse", "none")
 ACTIVATIONS = ("relu", "silu", "tanh")
-INITIALISERS = ("glorot", "orthogonal")
+INITIALIZERS = ("glorot", "orthogonal")
 
 
 @dataclass(frozen=True)
@@ -22,25 +22,25 @@ class _Network:
     """What every network model has, and an ensemble of them."""
 
     kind: str = setting("", "")
-    members: int = setting(1, "networks fitted side by side; each particle follows one of them")
+    ensemble_size: int = setting(1, "networks fitted side by side; each particle follows one of them")
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
-    low: float = setting(-10.0, "lower end of the interval of log z (log_normal), whose upper end is 0")
+    log_z_min: float = setting(-10.0, "lower end of the interval of log z (log_normal), whose upper end is 0")
     kl_weight: float = setting(0.1, "factor of the noise's KL divergence; 1 is the variational bound")
     weight_decay: float = setting(1.0, "factor of the Gaussian prior on the weights")
     activation: str = setting("silu", "nonlinearity: relu, silu, tanh")
-    initialiser: str = setting("glorot", "initial weights: glorot, orthogonal")
+    initializer: str = setting("glorot", "initial weights: glorot, orthogonal")
 
     def __post_init__(self) -> None:
         checks.typed("model", self)
         checks.kind("model", self.kind, type(self).kind)
-        checks.size("model.members", self.members)
+        checks.size("model.ensemble_size", self.ensemble_size)
         checks.layers("model.hidden", self.hidden)
-        kinds = dict(activation=ACTIVATIONS, dropout=DROPOUTS, initialiser=INITIALISERS)
+        kinds = dict(activation=ACTIVATIONS, dropout=DROPOUTS, initializer=INITIALIZERS)
         for name, choices in kinds.items():
             checks.choice(f"model.{name}", getattr(self, name), choices)
-        checks.least("model", self, 0, "kl_weight", "weight_decay")
-        checks.within("model.low", self.low, -math.inf, 0, open_high=True)
+        checks.check_minimum("model", self, 0, "kl_weight", "weight_decay")
+        checks.check_range("model.log_z_min", self.log_z_min, -math.inf, 0, open_high=True)
 
 
 @dataclass(frozen=True)

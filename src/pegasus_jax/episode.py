@@ -20,10 +20,10 @@ def run(key: Key, act: Callable[[Key, Array, Array], Array], task: Task) -> Traj
     The controller and the data see the state with sensor noise; the cost is of the true state. Where the task's `stop`
     says so it is over: the periods after that are no data, and cost `stop_cost`.
     """
-    return watch(key, act, task, lambda state, u: ())[0]
+    return run_with_trace(key, act, task, lambda state, u: ())[0]
 
 
-def watch(
+def run_with_trace(
     key: Key, act: Callable[[Key, Array, Array], Array], task: Task, look: Callable[[Any, Array], Any]
 ) -> tuple[Trajectory, Any]:
     """`run`, and what `look(plant's state, u [U])` returned at the beginning of each control period [H, ...]."""

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-from pegasus_jax.checks import ConfigError, nearest
+from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.config import (
     BNN,
     GP,
@@ -37,7 +37,7 @@ CARTPOLE = Config(
     task="cartpole",
     model=Lagrangian(substeps=_SUBSTEPS["cartpole"]),
     fit=Fit(steps=3000, learning_rate=3e-3),
-    search=Search(widen=2.0, balanced=True, refine=0.5),  # docs/decisions/0014 and 0015
+    search=Search(cost_width_start=2.0, standardized_noise=True, refine_fraction=0.5),  # docs/decisions/0014 and 0015
 )
 
 # docs/decisions/0006, 0008, 0009 and 0011.
@@ -51,13 +51,13 @@ DOUBLE_CARTPOLE = Config(
         steps=600,
         learning_rate=3e-3,
         decay=0.03,
-        match=False,
-        cost="particles",
-        anneal=14,
-        reheat=0.17,
-        limit=1.0,
-        loosen=30.0,
-        sensors="known",
+        moment_matching=False,
+        cost_estimator="particles",
+        anneal_trials=14,
+        warm_restart=0.17,
+        particle_grad_limit=1.0,
+        warm_limit_factor=30.0,
+        observation_noise="plant",
     ),
     explore=Explore(trials=4, kind="walk"),
 )
@@ -73,34 +73,33 @@ DOUBLE_CARTPOLE_NETWORK = Config(
 )
 
 
-def swimmer(maneuver: str, legs: int, learning_rate: float = 1e-4) -> Config:
-    """docs/reference.md 3.4 with five networks (docs/decisions/0017); the policy's dropout is the paper's .1."""
+def swimmer(maneuver: str, legs: int) -> Config:
+    """The networks of docs/reference.md 3.4, five of them (docs/decisions/0017), with the search of README's table."""
     return Config(
         task=f"swimmer_{maneuver}",
         legs=legs,
         trials=50,
-        model=BNN(hidden=(200,) * 4, initialiser="orthogonal", members=5, kl_weight=1.0),
-        policy=MLP(hidden=(200,) * 4, dropout=0.1, initialiser="orthogonal"),
+        model=BNN(hidden=(200,) * 4, initializer="orthogonal", ensemble_size=5, kl_weight=1.0),
+        policy=MLP(hidden=(200,) * 4, dropout=0.1, initializer="orthogonal"),
         fit=Fit(steps={2: 2000, 6: 4000}[legs]),
         search=Search(
             steps=500,
-            particles={2: 400, 6: 500}[legs],
-            learning_rate=learning_rate,
-            cost="particles",  # so it was measured
-            widen=1.0,
-            balanced=True,
-            refine=0.5,
-            anew=True,  # docs/decisions/0016
+            particles=200,
+            cost_estimator="particles",  # so it was measured
+            cost_width_start=1.0,
+            standardized_noise=True,
+            refine_fraction=0.5,
+            init="fresh",  # docs/decisions/0016
         ),
-        explore=Explore(trials=5, kind="walk"),
+        explore=Explore(trials=2, kind="walk"),
     )
 
 
 # A cost of one's own has no width to widen; its expectation is a mean over nodes: docs/decisions/0018.
-_OWN_COST = Search(widen=1.0, balanced=True, refine=0.5)
+_OWN_COST = Search(cost_width_start=1.0, standardized_noise=True, refine_fraction=0.5)
 
 _SWIMMERS = {
-    **{f"swimmer_{name}": swimmer(name, 2, 1e-3 if name == "depth_change" else 1e-4) for name in MANEUVERS},
+    **{f"swimmer_{name}": swimmer(name, 2) for name in MANEUVERS},
     **{f"swimmer_{name}_six_legs": swimmer(name, 6) for name in MANEUVERS},
 }
 
@@ -109,7 +108,7 @@ NETWORKS: dict[str, Config] = {
     "cartpole_network": replace(CARTPOLE, model=BNN(), fit=Fit()),
     "double_cartpole_network": DOUBLE_CARTPOLE_NETWORK,
     **{
-        f"{name}_network": replace(config, model=replace(config.model, members=1, kl_weight=BNN.kl_weight))
+        f"{name}_network": replace(config, model=replace(config.model, ensemble_size=1, kl_weight=BNN.kl_weight))
         for name, config in _SWIMMERS.items()
     },
 }
@@ -120,7 +119,7 @@ PRESETS: dict[str, Config] = {
     "double_cartpole_gpu": replace(  # eight policies side by side: docs/decisions/0010
         DOUBLE_CARTPOLE,
         fit=replace(DOUBLE_CARTPOLE.fit, steps=3000),
-        search=replace(DOUBLE_CARTPOLE.search, starts=8, particles=96, steps=2000),
+        search=replace(DOUBLE_CARTPOLE.search, num_starts=8, particles=96, steps=2000),
     ),
     **_SWIMMERS,
     # A robot runs a new policy only where it is expected to be better than the one before.
@@ -138,7 +137,7 @@ def _network(**changes: Any) -> Change:
 
 def _lagrangian(config: Config) -> Config:
     assert isinstance(config.model, BNN)
-    model = Lagrangian(initialiser=config.model.initialiser, substeps=_SUBSTEPS.get(config.task, Lagrangian.substeps))
+    model = Lagrangian(initializer=config.model.initializer, substeps=_SUBSTEPS.get(config.task, Lagrangian.substeps))
     return replace(config, model=model, fit=Fit(steps=3000, learning_rate=3e-3))
 
 
@@ -154,16 +153,16 @@ MODELS: dict[str, Change] = {
     "gaussian": _network(dropout="gaussian"),
     "sparse": _network(dropout="sparse"),
     "deterministic": _network(dropout="none"),
-    "ensemble": _network(dropout="none", members=5),
+    "ensemble": _network(dropout="none", ensemble_size=5),
     "lagrangian": _lagrangian,
-    "gp": lambda config: replace(config, model=GP(), fit=LBFGS(starts=10)),
+    "gp": lambda config: replace(config, model=GP(), fit=LBFGS(num_starts=10)),
     "ssgp": lambda config: replace(config, model=SSGP(), fit=LBFGS()),
 }
 POLICIES: dict[str, Change] = {
     "mlp": _dropout(0.0),
     "dropout_mlp": _dropout(0.1),
     "rbf": lambda config: replace(config, policy=RBF()),
-    "rbf100": lambda config: replace(config, policy=RBF(units=100)),
+    "rbf100": lambda config: replace(config, policy=RBF(num_centers=100)),
     "linear": lambda config: replace(config, policy=Linear()),
 }
 
@@ -175,7 +174,13 @@ def _papers(config: Config, **search: Any) -> Config:
         model = replace(model, activation="relu", kl_weight=1.0)
     if isinstance(fit, Fit):
         fit = replace(fit, learning_rate=1e-4)
-    plain = dict(cost="particles", widen=1.0, balanced=False, refine=0.0, restart=False, anew=False)
+    plain = dict(
+        cost_estimator="particles",
+        cost_width_start=1.0,
+        standardized_noise=False,
+        refine_fraction=0.0,
+        init="previous",
+    )
     changed = replace(config.search, **plain, **search)
     return replace(_dropout(0.1)(config), model=model, fit=fit, search=changed)
 
@@ -183,10 +188,10 @@ def _papers(config: Config, **search: Any) -> Config:
 ALGORITHMS: dict[str, Change] = {
     "pegasus": lambda config: config,  # what learned best (docs/decisions)
     # Alg. 3 as printed: all draws but the start particles held for a whole search.
-    "paper": lambda config: _papers(config, reset=False, period=Period(1, 0, 0, 0, 0)),
+    "paper": lambda config: _papers(config, reset_optimizer=False, period=Period(1, 0, 0, 0, 0)),
     # Alg. 2: everything redrawn every iteration, no clipping.
-    "deep_pilco": lambda config: _papers(config, particles=10, clip=None, period=Period(dynamics=1)),
-    "pilco": lambda config: replace(config, search=Analytic(particles=config.search.particles), precision="double"),
+    "deep_pilco": lambda config: _papers(config, particles=10, grad_clip=None, period=Period(dynamics=1)),
+    "pilco": lambda config: replace(config, search=Analytic(particles=config.search.particles), x64=True),
 }
 
 WORDS = {"preset": PRESETS, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
@@ -204,7 +209,7 @@ def preset(
     said = {"preset": name, "model": model, "policy": policy, "algorithm": algorithm}
     for word, value in said.items():
         if value is not None and value not in WORDS[word]:
-            raise ConfigError(f"{word}={value} is unknown; {nearest(value, WORDS[word])}")
+            raise ConfigError(f"{word}={value} is unknown; {did_you_mean(value, WORDS[word])}")
     config = PRESETS[name if model is None and algorithm in (None, "pegasus") else network(name)]
     for change in (MODELS[model or "log_normal"], ALGORITHMS[algorithm or "pegasus"]):
         config = change(config)

@@ -43,7 +43,7 @@ def together(tree: Any, axis: int) -> Any:
     return tree
 
 
-def alone_on_gpu(x: Any) -> bool:
+def pallas_allowed(x: Any) -> bool:
     """Whether a kernel of ours may compute in x's place: the compiler splits its own over devices, but not ours.
 
     It may where there is one GPU, and where every device runs its own part of a program (`each_its_own`).

@@ -126,7 +126,7 @@ class Cost(NamedTuple):
     # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not in closed form, but by cost.expected_by_nodes
     expected: Callable[[Array, Array], Array] | None = None
     # A factor -> (of_state, expected) of the same error with that many times the width. None: the cost has no width.
-    widen: Callable[[Array], tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]] | None = None
+    with_width: Callable[[Array], tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]] | None = None
 
 
 class Task(NamedTuple):
@@ -153,7 +153,7 @@ class Task(NamedTuple):
     # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not in closed form, but by cost.expected_by_nodes
     expected_cost: Callable[[Array, Array], Array] | None = None
     # A factor -> (cost, expected_cost) of the same error with that many times the width. None: the cost has no width.
-    widened: Callable[[Array], tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]] | None = None
+    cost_with_width: Callable[[Array], tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]] | None = None
     # reset(seed) -> x [D]; step(u [U]) -> (x [D], the control sent [U], how it ended or ""); close(). A plant outside
     # of JAX, of which there is one: a Gymnasium environment, maybe a robot.
     environment: Any = None

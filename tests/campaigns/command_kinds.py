@@ -25,7 +25,7 @@ VALUES = [
     *words_of("0x1F !!python/object/apply:os.getcwd 1e400 [.nan] [-1] ['a'] ../.. /dev/null = # : 1..3 1_0 ∞ ünï 二"),
     *("", " ", HUGE, "-" + HUGE, "x" * 5000, "[" * 200, "[" + "1," * 3000 + "1]", "a\nb", "'"),
 ]
-BASE = (*SMALL, "trials=1", "evaluation=0", "out=new")
+BASE = (*SMALL, "trials=1", "eval_episodes=0", "out=new")
 GYM = (*BASE[1:], "task=gym", "horizon=8", "angles=[0]", "start_mean=[3.14,0]")
 
 
@@ -63,7 +63,7 @@ def misspelt() -> list[Command]:
         + " mesh="
         + HUGE
         + "x1 legs=4 legs=6 env=Pendulum-v1 mjcf=arm.xml horizon=40"
-        " dt=.1 angles=[0] rates=[1] observe=[qpos.0] control_low=[-1] start_mean=[0] cost=robots:cost precision=half"
+        " dt=.1 angles=[0] rates=[1] observe=[qpos.0] control_low=[-1] start_mean=[0] cost=robots:cost x64=half"
     )
     return [train(word, refused=True) for word in words]
 
@@ -82,7 +82,12 @@ def combinations() -> list[Command]:
     )
     mjcf = (*BASE[1:], "task=mjcf", "cost=robots:cost")
     of_mjcf = ("mjcf=none.xml", "mjcf=.", "mjcf=robots.py", "mjcf=/dev/null", "mjcf=empty.xml")
-    texts = ["search.risk=.5", "search.starts=2 search.reset=false", "model.low=1", "policy.dropout=2"]
+    texts = [
+        "search.risk=.5",
+        "search.num_starts=2 search.reset_optimizer=false",
+        "model.log_z_min=1",
+        "policy.dropout=2",
+    ]
     lone = [("task=gym",), ("task=mjcf",), ("task=gym", "env=Pendulum-v1"), ("task=gym", "cost=robots:cost")]
     return [
         *(train(word, begin=gym, refused=True) for word in of_gym),

@@ -23,11 +23,11 @@ ROOT = Path(__file__).resolve().parents[2]
 RESULTS = ROOT / "benchmarks" / "results"
 # The smallest run that writes every kind of file.
 SMALL = [
-    *("task=cartpole", "model=log_normal", "model.hidden=[8]", "policy.hidden=[8]", "fit.steps=5", "fit.batch=20"),
+    *("task=cartpole", "model=log_normal", "model.hidden=[8]", "policy.hidden=[8]", "fit.steps=5", "fit.batch_size=20"),
     *("search.steps=5", "search.particles=10"),
 ]
 TRIALS = 3
-RUN = [*SMALL, f"trials={TRIALS}", "evaluation=1"]
+RUN = [*SMALL, f"trials={TRIALS}", "eval_episodes=1"]
 
 
 class Outcome(NamedTuple):

@@ -74,7 +74,7 @@ def words(case: Case) -> list[str]:
         f"env=robots:{case.robot}-v0",
         f"horizon={case.horizon}",
         f"search.steps={long}",
-        f"evaluation={episodes}",
+        f"eval_episodes={episodes}",
     ]
     return [*TINY, *chosen, "trials=3", "out=run"]
 

@@ -38,7 +38,7 @@ def compose(
 
     A `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
     With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
-    does not suit the config: a cost without a width, for example, needs `search.widen=1`.
+    does not suit the config: a cost without a width, for example, needs `search.cost_width_start=1`.
     """
     task = task if cost is None else with_cost(task, cost)
     dynamics = dynamics or dynamics_of(config.model, task)
@@ -66,7 +66,7 @@ def with_cost(task: Task, cost: Cost) -> Task:
     """The task with another cost. Raises ConfigError for a bare function."""
     if not isinstance(cost, Cost):
         raise ConfigError(f"cost={cost!r} is no Cost; a function of one state x [D] makes one: Cost(function)")
-    return task._replace(cost=cost.of_state, expected_cost=cost.expected, widened=cost.widen)
+    return task._replace(cost=cost.of_state, expected_cost=cost.expected, cost_with_width=cost.with_width)
 
 
 def set_precision(config: settings.Config) -> None:
@@ -74,6 +74,6 @@ def set_precision(config: settings.Config) -> None:
 
     That of products too, unless JAX was told: a GPU's usual 10 bits are too few for gradients of a whole rollout.
     """
-    jax.config.update("jax_enable_x64", config.precision == "double")
+    jax.config.update("jax_enable_x64", config.x64)
     if jax.default_backend() == "gpu" and jax.config.jax_default_matmul_precision is None:  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_default_matmul_precision", "float32")

@@ -26,7 +26,7 @@ from pegasus_jax.policies.squash import SQUASHES, to_limits
 from pegasus_jax.types import Dropout, Dynamics, Fitter, Policy, Task
 
 NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
-    "log_normal": lambda config: dropout.log_normal(config.low),
+    "log_normal": lambda config: dropout.log_normal(config.log_z_min),
     "binary": lambda _: dropout.binary(),
     "concrete": lambda _: dropout.concrete(),
     "gaussian": lambda _: dropout.gaussian(),
@@ -38,9 +38,9 @@ NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
 def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
     """The configured way of fitting a model."""
     if isinstance(config, settings.LBFGS):
-        return full_data(dynamics, starts=config.starts)
+        return full_data(dynamics, num_starts=config.num_starts)
     rate = falling(config.learning_rate, config.decay, config.steps)
-    return minibatches(dynamics, optax.adam(rate), batch=config.batch)
+    return minibatches(dynamics, optax.adam(rate), batch_size=config.batch_size)
 
 
 def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
@@ -56,7 +56,7 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
             member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
         case settings.BNN():
             member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic)
-    return ensemble(member, config.members) if config.members > 1 else member
+    return ensemble(member, config.ensemble_size) if config.ensemble_size > 1 else member
 
 
 def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
@@ -67,7 +67,7 @@ def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
         kl_weight=config.kl_weight,
         weight_decay=config.weight_decay,
         activation=config.activation,
-        initialiser=config.initialiser,
+        initializer=config.initializer,
     )
 
 
@@ -76,7 +76,7 @@ def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
     try:
         return NOISES[config.dropout](config)
     except ValueError as error:
-        raise ConfigError(f"model.dropout={config.dropout}: {error}") from error
+        raise ConfigError(f"model.dropout={config.dropout} model.log_z_min={config.log_z_min:g}: {error}") from error
 
 
 def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task) -> Policy:
@@ -93,7 +93,7 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
     match config:
         case settings.RBF():
             centers: dict[str, Any] = dict(
-                start=partial(start, task=task), waves=2 * len(task.angles), units=config.units
+                start=partial(start, task=task), waves=2 * len(task.angles), num_centers=config.num_centers
             )
             return rbf(**shared, **centers, saturate_moments=saturate_moments)
         case settings.Linear():
@@ -104,6 +104,6 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
                 features=features,
                 hidden=config.hidden,
                 dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
-                initialiser=config.initialiser,
+                initializer=config.initializer,
                 input_scale=tasks.input_scale(task, config.input_units),
             )

@@ -26,8 +26,6 @@ from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, Roll
 # (key, policy parameters, posterior) -> (rollout, cost [H, K])
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]
 
-AGGREGATES = {"mean": cost.mean, "total": cost.total}
-
 
 def search_of(
     search: settings.Search | settings.Analytic,
@@ -37,21 +35,22 @@ def search_of(
     spread: Spread = together,
 ) -> tuple[Searcher, Imagine]:
     """The configured way of improving a policy, and fresh imagined rollouts of the same kind."""
-    aggregate = AGGREGATES[search.aggregate]
-    known = tasks.known_sensors(task) if search.sensors == "known" else None
+    known = tasks.known_sensors(task) if search.observation_noise == "plant" else None
     noise = NoiseUse(search.policy_noise, search.state_noise, known)
     if isinstance(search, settings.Analytic):
-        return analytic_search_of(search, task, dynamics, policy, aggregate, noise)
-    if (search.match or search.balanced) and search.particles <= len(task.state_names):
-        states, what = len(task.state_names), "moment matching" if search.match else "balanced draws"
+        return analytic_search_of(search, task, dynamics, policy, noise)
+    if (search.moment_matching or search.standardized_noise) and search.particles <= len(task.state_names):
+        states, what = len(task.state_names), "moment matching" if search.moment_matching else "standardized noise"
         raise ConfigError(
             f"search.particles={search.particles} is too few: {what} of {states} dimensions needs at least {states + 1}"
         )
-    blocks = blocks_of(search.particles, task, dynamics, policy, balanced=search.balanced, spread=spread)
+    blocks = blocks_of(
+        search.particles, task, dynamics, policy, standardized_noise=search.standardized_noise, spread=spread
+    )
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
     # A particle's cost is 1 / K of the objective.
-    limit = None if search.limit is None else search.limit / search.particles
-    match = matching.match if search.match else matching.keep
+    limit = None if (most := search.particle_grad_limit) is None else most / search.particles
+    match = matching.match if search.moment_matching else matching.keep
     costs = costs_of(search, task)
     table = table_of(search)
     # What no row asks for is not compiled.
@@ -64,21 +63,22 @@ def search_of(
             posterior,
             given,
             **pieces,
-            aggregate=aggregate,
             limit=None if limit is None else limit * row.limit,
             match=either(refining, matching.keep, match),  # what refines has no matching, and each particle's own cost
             cost=costs(refining, row.cost_width if widens else None),
         )
 
-    clip = optax.identity() if search.clip is None else optax.clip_by_global_norm(search.clip)
+    clip = optax.identity() if search.grad_clip is None else optax.clip_by_global_norm(search.grad_clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
     draws = scenarios.sampler(blocks, Period(**vars(search.period)))
-    found = searcher(Problem(value, draws, optimizer, table, search.reset))
-    if search.starts > 1:
-        lasting = search.anneal > 1  # one schedule for all searches: who began late would be behind
-        window = 1 if search.refine else max(1, search.steps // 20)  # what refines may end with another than its last
+    found = searcher(Problem(value, draws, optimizer, table, search.reset_optimizer))
+    if search.num_starts > 1:
+        lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
+        window = (
+            1 if search.refine_fraction else max(1, search.steps // 20)
+        )  # what refines may end with another than its last
         fresh = lambda key, given: inherited(policy.init(key), given)  # noqa: E731
-        found = best_of(found, fresh, starts=search.starts, window=window, lasting=lasting)
+        found = best_of(found, fresh, num_starts=search.num_starts, window=window, lasting=lasting)
     # A refined policy is good for particles, not for their Gaussian.
     seen_last = matching.keep if refines else match
     return found, partial(imagined, **pieces, match=seen_last, blocks=blocks, task=task)
@@ -86,16 +86,15 @@ def search_of(
 
 def table_of(search: settings.Search) -> SearchTable:
     """What the configured search does, visit by visit."""
-    init = "fresh" if search.anew else "better" if search.restart else "previous"
     return search_table(
         search.steps,
-        init="previous" if search.starts > 1 else init,  # of several, others are fresh
-        refine=round((1 - search.refine) * search.steps) if search.refine else None,
-        widen=search.widen,
+        init="previous" if search.num_starts > 1 else search.init,  # of several, others are fresh
+        refine=round((1 - search.refine_fraction) * search.steps) if search.refine_fraction else None,
+        cost_width_start=search.cost_width_start,
         decay=search.decay,
-        anneal=search.anneal,
-        reheat=search.reheat,
-        loosen=search.loosen,
+        anneal_trials=search.anneal_trials,
+        warm_restart=search.warm_restart,
+        warm_limit_factor=search.warm_limit_factor,
     )
 
 
@@ -104,7 +103,6 @@ def analytic_search_of(
     task: Task,
     dynamics: Dynamics,
     policy: Policy,
-    aggregate: cost.Aggregate,
     noise: NoiseUse,
 ) -> tuple[Searcher, Imagine]:
     """PILCO's search. Raises ConfigError where a piece has no moments."""
@@ -134,14 +132,13 @@ def analytic_search_of(
             horizon=task.horizon,
             angles=task.angles,
             expected_cost=expected,
-            aggregate=aggregate,
             noise=noise,
         )
 
     begin, expected = (mean, jnp.diag(std**2)), expected_cost_of(task)
     blocks = blocks_of(search.particles, task, dynamics, policy)
     imagine = partial(imagined, **pieces, blocks=blocks, task=task, match=matching.keep, noise=noise)
-    return pilco.analytic(value, noise_std, restart=search.restart), imagine
+    return pilco.analytic(value, noise_std, restart=search.init == "better"), imagine
 
 
 def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Array | None], Callable[[Array], Array]]:
@@ -149,18 +146,18 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
 
     Raises ConfigError where the task's cost has no width.
     """
-    if search.widen > 1 and task.widened is None:
+    if search.cost_width_start > 1 and task.cost_with_width is None:
         raise ConfigError(
-            f"search.widen={search.widen:g} needs a cost with a width, which that of task={task.name} lacks;"
-            " the nearest is 1"
+            f"search.cost_width_start={search.cost_width_start:g} needs a cost with a width,"
+            f" which that of task={task.name} lacks; the nearest is 1"
         )
 
     def costs(refining: Array | None, width: Array | None) -> Callable[[Array], Array]:
         of_state, expected = task.cost, expected_cost_of(task)
-        if width is not None and task.widened is not None:
-            of_state, expected = task.widened(width)
+        if width is not None and task.cost_with_width is not None:
+            of_state, expected = task.cost_with_width(width)
         each = cost.of_particles(of_state)
-        if search.cost != "matched":
+        if search.cost_estimator != "gaussian":
             return until_stop(task, each)
         return until_stop(
             task, either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), cost.of_matched(expected))
@@ -186,7 +183,7 @@ def blocks_of(
     task: Task,
     dynamics: Dynamics,
     policy: Policy,
-    balanced: bool = False,
+    standardized_noise: bool = False,
     spread: Spread = together,
 ) -> scenarios.Blocks:
     """How the scenarios of a task's imagined rollouts are drawn."""
@@ -196,7 +193,7 @@ def blocks_of(
         start=partial(start, task=task),
         particles=particles,
         horizon=task.horizon,
-        balanced=balanced,
+        standardized_noise=standardized_noise,
         spread=spread,
     )
 

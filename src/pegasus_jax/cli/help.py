@@ -6,8 +6,8 @@ from pegasus_jax.cli.train import OPTIONS
 
 TRAIN = """\
 pegasus-train task=NAME [setting=value ...]     learn a controller
-pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that was killed; or with other evaluation=,
-                                                fit.* or search.* settings
+pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that was killed; or with other
+                                                eval_episodes=, fit.* or search.* settings
 
   task=cartpole         what to learn: {tasks}
   preset=NAME           begin with these settings instead of the task's own, which are preset=TASK: {presets};
@@ -28,6 +28,7 @@ pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that 
 A preset is a value for each of the settings below, which change it one by one; model=, policy= and algorithm= change
 whole sections of it first. Shown is what they are with the words beside --help:
 pegasus-train task=gym algorithm=paper --help
+
 {settings}
 {others}
 PEGASUS_SETTINGS="fit.steps=5 search.steps=5" in the environment adds these words to every pegasus-train and
@@ -37,10 +38,10 @@ examples
   pegasus-train task=cartpole
   pegasus-train task=cartpole policy.hidden=[50,50] seed=3 trials=10 out=runs/demo
   pegasus-train task=cartpole seeds=10
-  pegasus-train task=cartpole algorithm=deep_pilco search.clip=1
+  pegasus-train task=cartpole algorithm=deep_pilco search.grad_clip=1
   pegasus-train task=swimmer_corkscrew legs=6
   pegasus-train task=gym env=Pendulum-v1 cost=mymodule:cost horizon=40
-  pegasus-train task=gym env=robot:Arm-v0 cost=robot:cost start_mean=[3.14,0] evaluation=0       (a robot)
+  pegasus-train task=gym env=robot:Arm-v0 cost=robot:cost start_mean=[3.14,0] eval_episodes=0       (a robot)
   pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
   pegasus-train resume=runs/demo trials=20 search.steps=2000
 
@@ -141,4 +142,4 @@ def help_of(text: str, words: Sequence[str]) -> str:
         for kind, default in kinds.items()
         if kind != getattr(config, section).kind
     ]
-    return text.format(settings="\n".join(config_io.help_lines(config)), others="".join(others), **lists)
+    return text.format(settings=config_io.grouped_help(config), others="".join(others), **lists)

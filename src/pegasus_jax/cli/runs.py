@@ -71,7 +71,7 @@ def figures(words: Sequence[str]) -> None:
 
 def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False) -> tuple[Path, dict[str, str]]:
     """The run's folder, or with `many` maybe that of several seeds, and the options of a command that reads it."""
-    from pegasus_jax.checks import nearest
+    from pegasus_jax.checks import did_you_mean
     from pegasus_jax.runs import config_io, store
 
     named = [word for word in words if "=" not in word]
@@ -81,7 +81,7 @@ def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False)
     for key in rest:
         if key not in defaults:
             raise ConfigError(
-                f"{key} is not an option here; {nearest(key, defaults) if defaults else 'there are none'}"
+                f"{key} is not an option here; {did_you_mean(key, defaults) if defaults else 'there are none'}"
             )
     path = Path(named[0])
     if runs := store.seeds_of(path):

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax.checks import ConfigError, nearest, whole
+from pegasus_jax.checks import ConfigError, did_you_mean, whole
 from pegasus_jax.cli.main import main
 
 SWEEP = """\
@@ -34,10 +34,10 @@ OUT/SETTING-VALUE_.../seedN, and is checked before the first one starts.
 local and slurm need the extra `sweep`: pip install 'pegasus-jax[sweep]'. Everything else is as in pegasus-train --help.
 
 examples
-  pegasus-sweep task=cartpole search.clip=1,10,100 seed=0-2
+  pegasus-sweep task=cartpole search.grad_clip=1,10,100 seed=0-2
   pegasus-sweep task=cartpole policy.hidden=[50,50],[200,200] seed=0-9 | xargs -d '\\n' -P 2 -I{} sh -c {}
   pegasus-sweep task=cartpole,double_cartpole seeds=10 launcher=slurm slurm.gpus_per_node=1 slurm.time=60
-  pegasus-plot runs/sweep/search.clip-10     the curves of one combination's seeds
+  pegasus-plot runs/sweep/search.grad_clip-10     the curves of one combination's seeds
 """
 
 OPTIONS = ("launcher", "jobs", "out", "seeds", "mesh")
@@ -110,7 +110,7 @@ def check(job: Job) -> None:
     from pegasus_jax.runs import config_io, store
 
     _, words = config_io.split(job.words, ("out", *OF_TRAIN))
-    config = tasks.pinned(config_io.parse(words, options=OPTIONS))
+    config = tasks.resolve(config_io.parse(words, options=OPTIONS))
     set_precision(config)
     build(replace(config, seed=0))
     if store.holds(job.run):
@@ -173,7 +173,7 @@ def handle(words: Sequence[str]) -> None:
     options, rest = config_io.split(words, OPTIONS)
     launcher = options.get("launcher", "print")
     if launcher not in LAUNCHERS:
-        raise ConfigError(f"launcher={launcher} is unknown; {nearest(launcher, LAUNCHERS)}")
+        raise ConfigError(f"launcher={launcher} is unknown; {did_you_mean(launcher, LAUNCHERS)}")
     at_once = whole("jobs", options.get("jobs", "2"))
     out = Path(options.get("out", "runs/sweep"))
     of_slurm = {f"slurm_{key[6:]}": value for key, value in rest.items() if key.startswith("slurm.")}

@@ -44,10 +44,10 @@ def train(words: Sequence[str]) -> None:
     over = _configured(asked)
     config = _checked(asked, over)
     from pegasus_jax.runs import store
-    from pegasus_jax.runs.programs import leads
+    from pegasus_jax.runs.programs import is_main_process
     from pegasus_jax.runs.train import train_seeds
 
-    if asked.resumed is None and leads():
+    if asked.resumed is None and is_main_process():
         if store.seeds_of(asked.home):
             free = store.free(asked.home)
             raise ConfigError(f"out={asked.home} holds runs already; resume={asked.home} goes on, out={free} is free")
@@ -61,7 +61,7 @@ def train(words: Sequence[str]) -> None:
         final=asked.options.get("final") == "true",
         mesh=over,
     )
-    if leads():
+    if is_main_process():
         _summed_up(asked)
 
 
@@ -87,7 +87,7 @@ def _resumed(options: dict[str, str], rest: dict[str, str]) -> Asked:
     free = {"resume", "final", "mesh", "distributed", "coordinator", "processes", "process"}
     if wrong := sorted(key for key in {*rest, *options} - free if not _changeable(key)):
         raise ConfigError(
-            f"{wrong[0]} cannot be changed by resume=; only trials=, evaluation=, fit.*, search.* can, and mjcf= if"
+            f"{wrong[0]} cannot be changed by resume=; only trials=, eval_episodes=, fit.*, search.* can, and mjcf= if"
             " the file was moved"
         )
     home = Path(options["resume"])
@@ -119,14 +119,14 @@ def _configured(asked: Asked) -> Any:
     done = None if asked.resumed is None else len(store.readable_trials(asked.resumed)[0])
     print(display.announcement(config, asked.home, len(asked.runs), done), flush=True)
     _join(options)
-    from pegasus_jax.runs.programs import leads, share_processors
+    from pegasus_jax.runs.programs import is_main_process, share_processors
 
     if not {"mesh", "distributed", "coordinator"} & {*options}:
         search = config.search
-        particles = search.particles * search.starts if isinstance(search, Search) else None
+        particles = search.particles * search.num_starts if isinstance(search, Search) else None
         share_processors(len(asked.runs), particles)
     over = _mesh(options.get("mesh"), len(asked.runs))
-    if leads():
+    if is_main_process():
         print(display.devices(), flush=True)
     return over
 
@@ -136,14 +136,14 @@ def _checked(asked: Asked, over: Any) -> Config:
     from pegasus_jax.assembly.experiments import build
     from pegasus_jax.runs import restore
     from pegasus_jax.runs.check import RESETS, before_training, circles_found
-    from pegasus_jax.tasks import pinned
+    from pegasus_jax.tasks import resolve
 
     if asked.resumed is not None:
         config = restore.moved(asked.resumed, asked.config, asked.options.get("mjcf"))
         restore.announce(asked.resumed, config)
         build(replace(config, seed=0), over)
         return config
-    config = pinned(asked.config)
+    config = resolve(asked.config)
     task = build(replace(config, seed=0), over).task
     for note in circles_found(asked.config, config) + before_training(config, task, 1 if asked.given else RESETS):
         print(f"note: {note}", file=sys.stderr)
@@ -175,7 +175,7 @@ def check(words: Sequence[str]) -> None:
 
 def _changeable(key: str) -> bool:
     """Whether a run can go on with another value of this setting: what it has learned stays what it is."""
-    return key in ("trials", "evaluation", "mjcf") or key.startswith(("fit.", "search."))
+    return key in ("trials", "eval_episodes", "mjcf") or key.startswith(("fit.", "search."))
 
 
 def _join(options: dict[str, str]) -> None:

@@ -27,7 +27,6 @@ __all__ = [
 Cost = Callable[[Array], Array]  # x [D] -> scalar
 Error = Callable[[Array], Array]  # x [D] -> e [E], affine in the features of x
 Expected = Callable[[Array, Array], Array]  # (mean [D], cov [D, D]) of a Gaussian state -> scalar
-Aggregate = Callable[[Array], Array]  # costs [H, K] -> scalar
 
 
 def saturating(error: Error, width: Array | float) -> Cost:

@@ -11,7 +11,7 @@ from pegasus_jax.shapes import check_params, check_scenarios, check_shape
 from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenarios
 
 # Platform -> steps of the time loop compiled as one. Each round of a loop costs a GPU copies and launches
-# (docs/decisions/0013); a processor would only compile longer.
+# (docs/decisions/0013); a CPU would only compile longer.
 UNROLL = {"gpu": 25}
 
 

@@ -31,13 +31,13 @@ def blocks(
     start: Callable[[Key], Array],
     particles: int,
     horizon: int,
-    balanced: bool,
+    standardized_noise: bool,
     spread: Spread = together,
 ) -> Blocks:
     """How each part of the scenarios is drawn.
 
-    With `balanced`, the normal draws of every time step have exactly zero mean and unit covariance over the particles,
-    so that matched particles have exactly the moments asked for. `spread` lays particles out over devices (mesh.py).
+    With `standardized_noise`, the normal draws of every time step have exactly zero mean and unit covariance over the
+    particles, so that matched particles have exactly the moments asked for. `spread` lays particles out over devices.
     """
 
     deal = dynamics.deal or jax.vmap(dynamics.sample, (0, None))
@@ -49,7 +49,7 @@ def blocks(
         states = jax.eval_shape(start, key).shape[0]
         # Drawn as one long row: the same numbers, by loops that need not stop every few dimensions.
         z = jax.random.normal(key, (horizon * particles * states,)).reshape(horizon, particles, states)
-        return spread(standardize(z) if balanced else z, 1)
+        return spread(standardize(z) if standardized_noise else z, 1)
 
     return Blocks(
         start=lambda key, _: each(jax.vmap(start), key),

@@ -30,9 +30,9 @@ def fit(
     loss: Callable[[Params, Key, Batch, Params], Array],
     optimizer: optax.GradientTransformation,
     steps: int,
-    batch: int,
+    batch_size: int,
 ) -> tuple[Learner, FitInfo]:
-    """`steps` updates of the model's parameters, each on `batch` rows and fresh noise (Alg. 1 line 5).
+    """`steps` updates of the model's parameters, each on `batch_size` rows and fresh noise (Alg. 1 line 5).
 
     `optimizer` is any of optax, and `learner.optimizer` its state, `optimizer.init(params)`. A gradient with a
     non-finite entry changes neither. An optimizer that searches along a line gets the loss of the same rows and noise.
@@ -43,7 +43,7 @@ def fit(
 
     def step(learner: Learner, key: Key) -> tuple[Learner, tuple[Array, Array]]:
         row_key, noise_key = jax.random.split(key)
-        rows = minibatch(row_key, data, batch)
+        rows = minibatch(row_key, data, batch_size)
 
         def of_rows(params: Params) -> Array:
             return loss(params, noise_key, rows, context)
@@ -67,7 +67,7 @@ def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
     return lambda count: fall(jnp.asarray(count) % steps)
 
 
-def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch: int) -> Fitter:
+def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch_size: int) -> Fitter:
     """The fitter that takes `optimizer`'s steps on minibatches; each fit goes on with the moments of the one before."""
 
     def run(key: Key, learner: Learner, data: Dataset, steps: int) -> tuple[Learner, FitInfo]:
@@ -79,7 +79,7 @@ def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, 
             loss=dynamics.loss,
             optimizer=optimizer,
             steps=steps,
-            batch=batch,
+            batch_size=batch_size,
         )
 
     return Fitter(optimizer.init, run)

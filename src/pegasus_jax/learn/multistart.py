@@ -12,19 +12,19 @@ FRESH = 2**31 - 1  # what a search's key is folded with for fresh policies; for 
 
 
 def best_of(
-    searcher: Searcher, make: Callable[[Key, Params], Params], *, starts: int, window: int, lasting: bool = False
+    searcher: Searcher, make: Callable[[Key, Params], Params], *, num_starts: int, window: int, lasting: bool = False
 ) -> Searcher:
-    """The searcher that searches from `starts` policies under the same scenarios, all of them until the trial ends.
+    """The searcher that searches from `num_starts` policies under the same scenarios, all of them until the trial ends.
 
     The first is the policy it is given, the others are `make` (key, given policy) at iteration 0 of each trial; or of
     the first search where they are `lasting`, and then each goes on from trial to trial, whichever is the best. All
     begin a trial with a new optimizer. The learner's parameters are always those of the member
     with the lowest mean objective over the last `window` iterations, or as many as there were. Its optimizer is all
-    members: a `Learner` [starts, ...].
+    members: a `Learner` [num_starts, ...].
     """
 
     def init(params: Params) -> Learner:
-        members = jax.tree.map(lambda leaf: jnp.stack([leaf] * starts), params)
+        members = jax.tree.map(lambda leaf: jnp.stack([leaf] * num_starts), params)
         return Learner(members, jax.vmap(searcher.init)(members))
 
     def run(
@@ -40,7 +40,7 @@ def best_of(
         del fresh  # the members have others
 
         def gathered() -> Params:
-            keys = jax.random.split(jax.random.fold_in(key, FRESH), starts - 1)
+            keys = jax.random.split(jax.random.fold_in(key, FRESH), num_starts - 1)
             others = jax.vmap(make, (0, None))(keys, learner.params)
             return jax.tree.map(lambda own, rest: jnp.concatenate([own[None], rest]), learner.params, others)
 

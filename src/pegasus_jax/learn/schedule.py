@@ -36,39 +36,40 @@ def search_table(
     *,
     init: str = "previous",
     refine: int | None = None,
-    widen: float = 1.0,
+    cost_width_start: float = 1.0,
     decay: float = 1.0,
-    anneal: int = 1,
-    reheat: float = 0.0,
-    loosen: float = 1.0,
+    anneal_trials: int = 1,
+    warm_restart: float = 0.0,
+    warm_limit_factor: float = 1.0,
 ) -> SearchTable:
     """The table of searches of `steps` iterations each.
 
     init: what a search starts from: the `previous` policy, a `fresh` one, or the `better` of both.
     refine: the iteration from which it refines the better of what it found and what it was given; None: never.
-    widen: the cost's width at the start; it falls to 1, geometrically, by half of the coarse iterations.
+    cost_width_start: the cost's width at the start; it falls to 1, geometrically, by half of the coarse iterations.
     decay: the step size at the end of the coarse iterations, which falls from 1 as half a cosine.
-    anneal: searches over which width and step size fall once.
-    reheat, loosen: after those each search's step size falls from `reheat` to `decay` of it, under `loosen` times the
-    limit; with reheat=0 both stay as they are. Raises ValueError for another `init`.
+    anneal_trials: searches over which width and step size fall once.
+    warm_restart, warm_limit_factor: after those each search's step size falls from `warm_restart` to `decay` of it,
+    under `warm_limit_factor` times the limit; with warm_restart=0 both stay as they are. Raises ValueError for another
+    `init`.
     """
     if init not in INITS:
         raise ValueError(f"init={init!r}; choose from {', '.join(INITS)}")
     rows = np.array(_visits(steps, init, refine), np.int32).reshape(-1, 4)
     iteration, scenarios, action, candidate = rows.T
-    number = np.arange(anneal + 1 if anneal > 1 else 1)[:, None]
+    number = np.arange(anneal_trials + 1 if anneal_trials > 1 else 1)[:, None]
     i = number * steps + scenarios  # [T, R] counted over all searches
-    coarse = anneal * steps if refine is None else refine
-    over = coarse / 2 if widen > 1 else 0
-    width = widen ** np.maximum(0, 1 - i / over) if over else np.ones(i.shape)
+    coarse = anneal_trials * steps if refine is None else refine
+    over = coarse / 2 if cost_width_start > 1 else 0
+    width = cost_width_start ** np.maximum(0, 1 - i / over) if over else np.ones(i.shape)
     step_size = half_cosine(i / max(coarse, 1), 1, decay)
     if refine is not None:
         step_size = np.where(i < refine, step_size, half_cosine((i - refine) / max(steps - refine, 1), 1, REFINED))
     limit = np.ones(i.shape)
-    if reheat:
-        annealed = number < anneal
-        step_size = np.where(annealed, step_size, half_cosine(scenarios / steps, reheat, decay))
-        limit = np.where(annealed, limit, loosen)
+    if warm_restart:
+        annealed = number < anneal_trials
+        step_size = np.where(annealed, step_size, half_cosine(scenarios / steps, warm_restart, decay))
+        limit = np.where(annealed, limit, warm_limit_factor)
     refines = np.zeros(len(rows), bool) if refine is None else scenarios >= refine
     return SearchTable(iteration, scenarios, action, candidate, refines, width, step_size, limit)
 

@@ -31,7 +31,7 @@ class Problem(NamedTuple):
     sampler: Sampler
     optimizer: optax.GradientTransformation  # any of optax
     table: SearchTable
-    reset: bool = True  # whether each search starts with a new optimizer state
+    reset_optimizer: bool = True  # whether each search starts with a new optimizer state
 
 
 def searcher(problem: Problem) -> Searcher:
@@ -99,7 +99,7 @@ def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
 def begun(learner: Learner, first: Array | int, problem: Problem) -> Learner:
     """The learner as the search has it: new at its iteration 0, later as it is."""
     params, state = learner
-    fresh = problem.optimizer.init(params) if problem.reset else state.optimizer
+    fresh = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
     begins = jnp.asarray(first) == 0
     optimizer, start = optax.tree.where(begins, (fresh, params), (state.optimizer, state.start))
     return Learner(params, state._replace(optimizer=optimizer, start=start))

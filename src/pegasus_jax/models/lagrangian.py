@@ -12,7 +12,7 @@ from pegasus_jax.math.angles import encode
 from pegasus_jax.math.normalize import whitener
 from pegasus_jax.models._lagrangian_components import GREATEST_CHANGE, GREATEST_SPEED, LEAST_MASS, substituted
 from pegasus_jax.models.networks import HEADS, Masks, noisy
-from pegasus_jax.sharding import alone_on_gpu
+from pegasus_jax.sharding import pallas_allowed
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 
 # Of Student's t, the likelihood. A pendulum that spins fast turns by radians between two steps of the integration, and
@@ -155,7 +155,7 @@ def lagrangian(
         each = jax.vmap(apply, (None, 0, 0, 0))
 
         def together(posterior: Posterior, masks: Masks, x: Array, u: Array) -> Prediction:
-            if apply is not predict or not alone_on_gpu(x):
+            if apply is not predict or not pallas_allowed(x):
                 return each(posterior, masks, x, u)
             from pegasus_jax.models import _lagrangian_pallas as kernel  # what it needs of JAX is for GPUs
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from pegasus_jax.types import Array, Dropout, Key, Params, Prediction
 
-INITIALISERS: dict[str, Callable] = {
+INITIALIZERS: dict[str, Callable] = {
     "glorot": nn.initializers.glorot_normal(),
     "orthogonal": nn.initializers.orthogonal(),
 }
@@ -42,13 +42,13 @@ class MLP(nn.Module):
 
     hidden: tuple[int, ...]
     outputs: int
-    initialiser: str = "glorot"
+    initializer: str = "glorot"
     activation: str = "relu"
 
     @nn.compact
     def __call__(self, x: Array, masks: Sequence[Array | None]) -> Array:
         """Outputs [..., outputs] for inputs x [..., F]; masks[i] broadcasts against layer i's input."""
-        kernel_init = INITIALISERS[self.initialiser]
+        kernel_init = INITIALIZERS[self.initializer]
         for i, width in enumerate((*self.hidden, self.outputs)):
             mask = masks[i]
             x = x if mask is None else x * mask
@@ -88,13 +88,13 @@ def noisy(
     kl_weight: float = 1.0,
     weight_decay: float = 1.0,
     activation: str = "relu",
-    initialiser: str = "glorot",
+    initializer: str = "glorot",
 ) -> Noisy:
     """Each layer but the first multiplies its input by noise of `dropout`; the network's own inputs carry none.
 
     `kl_weight` and `weight_decay` scale the KL of the noise and the Gaussian weight prior.
     """
-    network = MLP(hidden, outputs, initialiser, activation)
+    network = MLP(hidden, outputs, initializer, activation)
     kinds = (None, *(dropout for _ in hidden))
     widths = (features, *hidden)
 

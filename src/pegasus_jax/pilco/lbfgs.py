@@ -68,10 +68,10 @@ def minimize(function: Callable[[Params], Array], params: Params, steps: int) ->
     )
 
 
-def full_data(dynamics: Dynamics, *, starts: int) -> Fitter:
+def full_data(dynamics: Dynamics, *, num_starts: int) -> Fitter:
     """The fitter that minimizes the loss over all rows at once, from the best of several starts.
 
-    The starts are the current parameters and `starts` fresh draws of `dynamics.init`. The loss must be a function of
+    The starts are the current parameters and `num_starts` draws of `dynamics.init`. The loss must be a function of
     the parameters and of `prepare(data)` alone: it is given one key and all rows of the data set, used or not. Nothing
     but the parameters is carried from one fit to the next.
     """
@@ -83,7 +83,7 @@ def full_data(dynamics: Dynamics, *, starts: int) -> Fitter:
         def loss(params: Params) -> Array:
             return dynamics.loss(params, loss_key, Batch(data.x, data.u, data.y), context)
 
-        fresh = jax.vmap(dynamics.init)(jax.random.split(init_key, starts))
+        fresh = jax.vmap(dynamics.init)(jax.random.split(init_key, num_starts))
         candidates = jax.tree.map(lambda now, new: jnp.concatenate([now[None], new]), learner.params, fresh)
         # One after the other: kernel matrices of all candidates at once would fill the memory.
         losses = jax.lax.map(loss, candidates)

@@ -21,7 +21,7 @@ def rbf(
     start: Callable[[Key], Array],
     waves: int,
     controls: int,
-    units: int,
+    num_centers: int,
     saturate: Callable[[Array], Array],
     saturate_moments: Map | None,
 ) -> Policy:
@@ -34,12 +34,12 @@ def rbf(
 
     def init(key: Key) -> Params:
         centre_key, target_key = jax.random.split(key)
-        centres = jax.vmap(lambda k: encode(start(k)))(jax.random.split(centre_key, units))
+        centres = jax.vmap(lambda k: encode(start(k)))(jax.random.split(centre_key, num_centers))
         features = centres.shape[1]
         lengthscales = jnp.where(jnp.arange(features) < features - waves, 1.0, 0.7).astype(centres.dtype)
         return {
             "centres": centres,  # [n, F]
-            "targets": 0.1**0.5 * jax.random.normal(target_key, (controls, units), centres.dtype),  # [U, n]
+            "targets": 0.1**0.5 * jax.random.normal(target_key, (controls, num_centers), centres.dtype),  # [U, n]
             "lengthscales": jnp.tile(jnp.log(jnp.expm1(lengthscales)), (controls, 1)),  # [U, F], before softplus
         }
 

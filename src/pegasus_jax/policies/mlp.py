@@ -19,14 +19,14 @@ def mlp(
     hidden: tuple[int, ...],
     dropout: Dropout,
     saturate: Callable[[Array], Array],
-    initialiser: str,
+    initializer: str,
     input_scale: Array | float = 1.0,
 ) -> Policy:
     """u = saturate(network(encode(x) * input_scale)); noise is on each hidden layer's output (docs/reference.md 5.1).
 
     What the data have large is standardized on its way in, see `scaled`.
     """
-    network = MLP(hidden, controls, initialiser)
+    network = MLP(hidden, controls, initializer)
 
     def init(key: Key) -> Params:
         net_key, *keys = jax.random.split(key, 1 + len(hidden))

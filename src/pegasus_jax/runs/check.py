@@ -125,7 +125,7 @@ def report(config: Config) -> list[str]:
 
     given = bool(config.start_mean)
     set_precision(config)
-    asked, config = config, tasks.pinned(config)
+    asked, config = config, tasks.resolve(config)
     task = build(replace(config, seed=0)).task
     notes = circles_found(asked, config) + before_training(config, task, 1 if given else RESETS)
     start = jnp.asarray(task.start_mean, float)

@@ -11,7 +11,7 @@ from pegasus_jax.checks import RunError
 from pegasus_jax.experiment import COLLECT, trial_key
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs.job import Job
-from pegasus_jax.runs.programs import fetched, leads
+from pegasus_jax.runs.programs import gather, is_main_process
 from pegasus_jax.tasks import user_code
 from pegasus_jax.types import Episode, RunState, Task, Trajectory
 
@@ -33,7 +33,9 @@ def collected(job: Job, states: RunState, trial: int) -> list[Episode]:
     episodes = []
     for index, ran in enumerate(ran for ran in known if ran is not None):
         now = costed(job, ran, trial)
-        if now is not ran and task.environment is None and leads():  # a damaged file, or a cost that its user mended
+        if (
+            now is not ran and task.environment is None and is_main_process()
+        ):  # a damaged file, or a cost that its user mended
             where = job.writer.where(index, trial)
             job.display.line(f"{where} has costs that are not finite; counted again from its observations")
         episodes.append(now)
@@ -43,7 +45,7 @@ def collected(job: Job, states: RunState, trial: int) -> list[Episode]:
 def gathered(job: Job, states: RunState, trial: int, known: list[Episode | None]) -> list[Episode]:
     """The known episodes, and for those that are not, ones that are run on the plant and handed to the writer."""
     task, random = job.experiment.task, job.random(trial)
-    keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(fetched(states.key))
+    keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(gather(states.key))
     fresh = job.program.collect(keys, states.policy.params, random)
     policies = policies_that_run(job, states, trial)
     for index, ran in enumerate(fresh):
@@ -56,7 +58,7 @@ def gathered(job: Job, states: RunState, trial: int, known: list[Episode | None]
 
 def policies_that_run(job: Job, states: RunState, trial: int) -> np.ndarray:
     """The trial [S] after which the policy that runs in this trial's episode was learned; 0 for random controls."""
-    learned = np.asarray(fetched(states.policy_trial))
+    learned = np.asarray(gather(states.policy_trial))
     return np.zeros_like(learned) if job.random(trial) else learned
 
 

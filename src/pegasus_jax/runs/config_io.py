@@ -12,11 +12,11 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from pegasus_jax.checks import ConfigError, called, nearest, shown
+from pegasus_jax.checks import ConfigError, called, did_you_mean, shown
 from pegasus_jax.config import KINDS, TASKS, Config
 from pegasus_jax.presets import WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
-from pegasus_jax.runs.removed import refuse, without
+from pegasus_jax.runs.removed import refuse, today
 
 # Keys that select what a command begins with, and what they select from.
 NAMED: dict[str, Any] = {"task": TASKS, **WORDS}
@@ -44,7 +44,7 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     chosen = {name: words.pop(name) for name in NAMED if name in words}
     for name, value in chosen.items():
         if value not in NAMED[name]:
-            raise ConfigError(f"{name}={value} is unknown; {nearest(value, NAMED[name])}")
+            raise ConfigError(f"{name}={value} is unknown; {did_you_mean(value, NAMED[name])}")
     given = {key: words[key] for key in ("legs",) if key in words}
     task, begin = chosen.pop("task", None), chosen.pop("preset", None)
     if begin is None:
@@ -135,6 +135,14 @@ def help_lines(node: Any, prefix: str = "") -> list[str]:
     return lines
 
 
+def grouped_help(config: Config) -> str:
+    """The lines of `help_lines` under two titles: the settings of the method, and those of a plant of your own."""
+    plant = [line for line in help_lines(config) if line.split("=")[0].strip() in used_by()]
+    method = [line for line in help_lines(config) if line not in plant]
+    titled = {"the method": method, "the plant, where a task leaves it to you": plant}
+    return "\n\n".join("\n".join([title, *lines]) for title, lines in titled.items())
+
+
 def save(config: Config, path: Path) -> None:
     """Write the resolved config as YAML that `load` reads; the file appears whole or not at all."""
     text = OmegaConf.to_yaml(OmegaConf.create(plain(config)))
@@ -163,9 +171,9 @@ def stored_config(stored: dict[str, Any]) -> Config:
     chosen = {section: stored.get(f"{section}.kind") for section in KINDS}
     for section, kind in chosen.items():
         if kind not in (None, *KINDS[section]):
-            raise ConfigError(f"{section}.kind={kind} is unknown; {nearest(kind, KINDS[section])}")
+            raise ConfigError(f"{section}.kind={kind} is unknown; {did_you_mean(kind, KINDS[section])}")
     config = Config(**{section: KINDS[section][kind] for section, kind in chosen.items() if kind is not None})
-    stored = without(stored)
+    stored = today(stored)
     if wrong := sorted(set(stored) - set(leaves(config))):
         raise ConfigError(f"not the config of a run of this version: see {', '.join(wrong[:5])}")
     return override(config, stored)
@@ -173,7 +181,7 @@ def stored_config(stored: dict[str, Any]) -> Config:
 
 def _hint(key: str, choices: Sequence[str]) -> str:
     """The nearest choice; all of them only when they are few."""
-    text = nearest(key, choices).removesuffix(f"choices: {', '.join(choices)}")
+    text = did_you_mean(key, choices).removesuffix(f"choices: {', '.join(choices)}")
     return f"{text}--help lists all settings"
 
 

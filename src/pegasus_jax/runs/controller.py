@@ -25,7 +25,7 @@ class Controller:
         self.trial = int(state.trial)
         circles = experiment.task.circles
         self._params, self._size = state.policy.params, len(experiment.task.state_names) + len(circles)
-        double = config.precision == "double"
+        double = config.x64
         self._type, self._width = (np.float64, partial(jax.enable_x64, True)) if double else (np.float32, nullcontext)
         with restore.precision(config):
             act = jax.jit(lambda params, x: experiment.policy.apply(params, None, to_state(x, circles)))

@@ -57,7 +57,7 @@ def to_task(found: Any, where: str) -> Task:
         raise RunError(f"{where} is damaged: its task has no usable {str(error) or 'facts'}") from error
     from pegasus_jax.types import Task
 
-    return Task(plant=None, cost=unknown_cost, widened=lambda _: (unknown_cost, unknown_cost), **known)
+    return Task(plant=None, cost=unknown_cost, cost_with_width=lambda _: (unknown_cost, unknown_cost), **known)
 
 
 def unknown_cost(*_: Any) -> Any:

@@ -16,7 +16,7 @@ from pegasus_jax.config import Config
 from pegasus_jax.learn.data import grow
 from pegasus_jax.runs import restore, writers
 from pegasus_jax.runs.display import Display
-from pegasus_jax.runs.programs import Program, leads
+from pegasus_jax.runs.programs import Program, is_main_process
 from pegasus_jax.runs.writers import Writer
 from pegasus_jax.types import Experiment, RunState
 
@@ -46,7 +46,7 @@ def opened(config: Config, seeds: Sequence[int], mesh: Mesh | None = None) -> It
     experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
     try:
         program = Program(experiment, config.search.steps, len(seeds), mesh)
-        display = Display(config.trials, quiet=not leads())
+        display = Display(config.trials, quiet=not is_main_process())
         with display.running():
             program.on_compile = display.compiling
             yield Job(config, seeds, experiment, program, display, writers.nothing(len(seeds)))

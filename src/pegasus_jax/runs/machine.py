@@ -1,4 +1,4 @@
-"""What a run was made with: versions, machine, processors."""
+"""What a run was made with: versions, machine, CPUs."""
 
 import os
 import platform
@@ -10,7 +10,7 @@ from typing import Any
 
 
 def processors() -> int:
-    """How many processors this process may use."""
+    """How many CPUs this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -35,13 +35,13 @@ def about(command: str) -> dict[str, Any]:
     }
 
 
-# What tells processors apart: a virtual machine may call two generations by one name.
+# What tells CPUs apart: a virtual machine may call two generations by one name.
 NAMED = {"model name": "", "cpu family": "family ", "model": "model "}
 
 
 @cache
 def processor() -> dict[str, str]:
-    """What the system says of its first processor, at least its "model name"; on Linux also what it can execute."""
+    """What the system says of its first CPU, at least its "model name"; on Linux also what it can execute."""
     known = {"model name": f"{platform.machine()} {platform.processor()}"}
     try:
         lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()

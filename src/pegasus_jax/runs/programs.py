@@ -29,21 +29,21 @@ GRAPHS = {
     "xla_gpu_enable_command_buffer": "CONDITIONAL,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,FUSION,WHILE"
 }
 # And side by side the kernels of a graph that do not wait for each other (docs/decisions/0013).
-ABREAST = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+CONCURRENT_KERNELS = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
 
-# The compiler's options by platform. On a processor what runs for milliseconds need not be compiled well: without
+# The compiler's options by platform. On a CPU what runs for milliseconds need not be compiled well: without
 # emitters it is ready in two thirds of the time, and a tenth slower. A fit or a search runs for seconds, and gains by
 # wide vectors; the compiler's highest level gains it nothing over the first, which takes a tenth less.
-BRIEFLY: dict[str, dict] = {
+FAST_COMPILE: dict[str, dict] = {
     "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
-    "gpu": GRAPHS | ABREAST,
+    "gpu": GRAPHS | CONCURRENT_KERNELS,
 }
-LASTING: dict[str, dict] = {
+FAST_RUN: dict[str, dict] = {
     "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512},
-    "gpu": GRAPHS | ABREAST,
+    "gpu": GRAPHS | CONCURRENT_KERNELS,
 }
 LONG = ("fit", "search")
-FEW = 128  # particles that one thread of a processor imagines as fast as two
+SINGLE_THREAD_BELOW = 128  # particles that one thread of a CPU imagines as fast as two
 
 
 class Jitted:
@@ -107,7 +107,7 @@ class Program:
         self.parts = {
             name: Jitted(
                 over_seeds(function, axes, seeds=seeds, over=over),
-                compiler_options=compiler_options(LASTING if name in LONG else BRIEFLY),
+                compiler_options=compiler_options(FAST_RUN if name in LONG else FAST_COMPILE),
                 **layout,
             )
             for name, (function, axes) in functions.items()
@@ -126,7 +126,7 @@ class Program:
         rest = others or tuple(jax.ShapeDtypeStruct((), jnp.int32) for _ in self.axes[part][1:])
         arguments: tuple[Any, ...] = (states, *rest)
         if self.mesh is not None:
-            arguments = self.laid_out(part, arguments, described)
+            arguments = self.laid_out(part, arguments, shape_structs)
         jitted.coming = begun(jitted.compile, *arguments)
 
     def laid_out(self, part: str, arguments: tuple, lay: Callable[[Any, NamedSharding], Any]) -> tuple:
@@ -140,7 +140,7 @@ class Program:
         interrupt.check()  # one that came while a library swallowed it
         jitted, name = self.parts[part], purpose or part
         if self.mesh is not None:
-            arguments = self.laid_out(part, arguments, placed)
+            arguments = self.laid_out(part, arguments, shard)
         began, compiled = time.monotonic(), jitted.seconds
         if jitted.compiled is None:
             with self.on_compile(part):
@@ -154,7 +154,7 @@ class Program:
     def collect(self, keys: Any, params: Params, exploring: bool, purpose: str = "collect") -> list[Episode]:
         """An episode of each seed's policy [S, ...], or of random controls."""
         if self.drive is None:
-            ran: Trajectory = fetched(self("episode", keys, params, jnp.asarray(exploring), purpose=purpose))
+            ran: Trajectory = gather(self("episode", keys, params, jnp.asarray(exploring), purpose=purpose))
             alone = [trimmed(jax.tree.map(lambda leaf: leaf[i], ran)) for i in range(self.seeds)]  # noqa: B023
             return [Episode(one, "horizon" if len(one.u) == self.horizon else "terminated") for one in alone]
         began = time.monotonic()
@@ -169,9 +169,9 @@ class Program:
         """Costs [S, E, H] of episodes on a plant in JAX of the policies, one for each key [S, E]."""
         follow = jnp.asarray(False)  # the policy, not random controls
         if self.side_by_side:
-            return np.asarray(fetched(self("evaluate", keys, params, follow).cost))
+            return np.asarray(gather(self("evaluate", keys, params, follow).cost))
         several = (self("episode", some, params, follow, purpose="evaluate") for some in jnp.swapaxes(keys, 0, 1))
-        return np.stack([np.asarray(fetched(episode.cost)) for episode in several], axis=1)
+        return np.stack([np.asarray(gather(episode.cost)) for episode in several], axis=1)
 
     def seconds(self) -> dict[str, float]:
         """Seconds spent in each part since the last call."""
@@ -208,7 +208,9 @@ def share_processors(seeds: int, particles: int | None = None) -> None:
     if told:
         return
     jax.config.update("jax_num_cpu_devices", max(n for n in range(1, processors() + 1) if seeds % n == 0))
-    if particles is not None and seeds * particles <= FEW and not entry_points(group="jax_plugins"):  # no accelerator
+    if (
+        particles is not None and seeds * particles <= SINGLE_THREAD_BELOW and not entry_points(group="jax_plugins")
+    ):  # no accelerator
         os.environ.setdefault("NPROC", "1")  # what XLA asks for the number of its threads
 
 
@@ -250,7 +252,7 @@ def over_seeds(
     return alone
 
 
-def placed(tree: Any, layout: NamedSharding) -> Any:
+def shard(tree: Any, layout: NamedSharding) -> Any:
     """The tree's arrays laid out over devices; arrays that other processes hold too are equal there."""
 
     def put(leaf: Any) -> Any:
@@ -265,12 +267,12 @@ def placed(tree: Any, layout: NamedSharding) -> Any:
     return jax.tree.map(put, tree)
 
 
-def described(tree: Any, layout: NamedSharding) -> Any:
+def shape_structs(tree: Any, layout: NamedSharding) -> Any:
     """The shapes of a tree's arrays when they are laid out over devices."""
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=layout), tree)
 
 
-def fetched(tree: Any) -> Any:
+def gather(tree: Any) -> Any:
     """The tree's arrays whole on this process, whatever devices of whatever process hold them."""
     if jax.process_count() == 1:
         return tree
@@ -283,7 +285,7 @@ def fetched(tree: Any) -> Any:
     return jax.tree.map(get, tree)
 
 
-def leads() -> bool:
+def is_main_process() -> bool:
     """Whether this process is the one that writes files and speaks."""
     return jax.process_index() == 0
 

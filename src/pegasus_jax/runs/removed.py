@@ -1,5 +1,7 @@
 """Settings of earlier versions: what a config stored by one of them means today, and what serves instead."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from pegasus_jax.checks import ConfigError, shown
@@ -10,6 +12,15 @@ class Removed(NamedTuple):
 
     always: Any  # the value that it had by default, and that is now the only one
     instead: str  # what serves where another value was wanted
+
+
+class Renamed(NamedTuple):
+    """A setting that has another name."""
+
+    key: str
+    values: Mapping[Any, Any] = MappingProxyType(
+        {}
+    )  # old value -> new value, of those that changed; None: it says nothing
 
 
 REMOVED = {
@@ -24,26 +35,71 @@ REMOVED = {
     "policy.execution": Removed("sampled", "policy.dropout=0, or pegasus_jax.controller, the mean of any policy"),
     "policy.output_scale": Removed(1.0, "a policy of your own, with of_pair"),
     "fit.reset": Removed(False, "a fit goes on with Adam's moments of the one before"),
-    "search.discount": Removed(1.0, "search.aggregate= is mean or total, of all steps alike"),
-    "search.risk": Removed(1.0, "search.aggregate= is mean or total, of all particles alike"),
-    "search.truncate": Removed(None, "search.limit=1 drops a particle's gradient where it grows too long"),
-    "search.best": Removed(False, "search.refine=0.5 ends with the better of the new policy and the old one"),
+    "search.aggregate": Removed("mean", "objective(aggregate=costs.total) in a search of your own is the paper's sum"),
+    "search.discount": Removed(1.0, "objective(aggregate=) in a search of your own"),
+    "search.risk": Removed(1.0, "objective(aggregate=) in a search of your own"),
+    "search.truncate": Removed(
+        None, "search.particle_grad_limit=1 drops a particle's gradient where it grows too long"
+    ),
+    "search.best": Removed(False, "search.refine_fraction=0.5 ends with the better of the new policy and the old one"),
     "search.cost_noise": Removed(0.0, "search.state_noise= is noise on the state itself, which the cost sees"),
+}
+
+RENAMED = {
+    "precision": Renamed("x64", {"single": False, "double": True}),
+    "evaluation": Renamed("eval_episodes"),
+    "model.members": Renamed("model.ensemble_size"),
+    "model.low": Renamed("model.log_z_min"),
+    "model.initialiser": Renamed("model.initializer"),
+    "policy.initialiser": Renamed("policy.initializer"),
+    "policy.units": Renamed("policy.num_centers"),
+    "fit.batch": Renamed("fit.batch_size"),
+    "fit.starts": Renamed("fit.num_starts"),
+    "search.clip": Renamed("search.grad_clip"),
+    "search.match": Renamed("search.moment_matching"),
+    "search.balanced": Renamed("search.standardized_noise"),
+    "search.cost": Renamed("search.cost_estimator", {"matched": "gaussian"}),
+    "search.refine": Renamed("search.refine_fraction"),
+    "search.widen": Renamed("search.cost_width_start"),
+    "search.anneal": Renamed("search.anneal_trials"),
+    "search.limit": Renamed("search.particle_grad_limit"),
+    "search.reheat": Renamed("search.warm_restart"),
+    "search.loosen": Renamed("search.warm_limit_factor"),
+    "search.reset": Renamed("search.reset_optimizer"),
+    "search.restart": Renamed("search.init", {False: "previous", True: "better"}),
+    "search.anew": Renamed("search.init", {False: None, True: "fresh"}),  # where it is false, search.restart decides
+    "search.starts": Renamed("search.num_starts"),
+    "search.sensors": Renamed("search.observation_noise", {"predicted": "model", "known": "plant"}),
 }
 
 
 def refuse(key: str) -> None:
-    """Raises ConfigError for a word of the command line that names a removed setting."""
+    """Raises ConfigError for a word of the command line that names a setting of an earlier version."""
     if key in REMOVED:
         raise ConfigError(f"{key} was removed; instead: {REMOVED[key].instead}")
+    if key in RENAMED:
+        now, values = RENAMED[key]
+        known = ", ".join(f"{shown(old)} is {shown(new)}" for old, new in values.items() if new is not None)
+        raise ConfigError(f"{key} is now called {now}{known and f', where {known}'}")
 
 
-def without(stored: dict[str, Any]) -> dict[str, Any]:
-    """A stored config without what was removed since. Raises ConfigError where that had another value than today's."""
-    for key, value in stored.items():
+def today(stored: dict[str, Any]) -> dict[str, Any]:
+    """A stored config in the words of this version.
+
+    Raises ConfigError where a removed setting had another value than the one that is left.
+    """
+    found: dict[str, Any] = {}
+    for key, value in sorted(stored.items(), key=lambda item: item[0] == "search.anew"):  # after search.restart
         if key in REMOVED and value != REMOVED[key].always:
             raise ConfigError(
                 f"{key}={shown(value)} was removed, only {shown(REMOVED[key].always)} is left;"
                 f" an earlier version of pegasus_jax reads this run"
             )
-    return {key: value for key, value in stored.items() if key not in REMOVED}
+        if key in RENAMED:
+            now, values = RENAMED[key]
+            changed = values.get(value, value) if isinstance(value, str | bool) else value
+            if changed is not None or not values:
+                found[now] = changed
+        elif key not in REMOVED:
+            found[key] = value
+    return found

@@ -151,7 +151,7 @@ def suited(states: RunState, fresh: RunState) -> RunState:
 def precision(config: Config) -> Iterator[None]:
     """JAX as a config wants it, in this block only."""
     products = jax.config.jax_default_matmul_precision or "float32"  # pyright: ignore[reportAttributeAccessIssue]
-    with jax.enable_x64(config.precision == "double"), jax.default_matmul_precision(products):
+    with jax.enable_x64(config.x64), jax.default_matmul_precision(products):
         yield
 
 

@@ -23,7 +23,7 @@ from pegasus_jax.runs.collect import collected, policies_that_run, stacked
 from pegasus_jax.runs.display import summary
 from pegasus_jax.runs.evaluation import evaluate, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
-from pegasus_jax.runs.programs import fetched, leads
+from pegasus_jax.runs.programs import gather, is_main_process
 from pegasus_jax.runs.writers import Row, part
 from pegasus_jax.types import RunState, Trajectory
 
@@ -69,7 +69,7 @@ def train_seeds(
     """
     folders = list(runs.values())
     with ExitStack() as held:
-        for run in folders if leads() else ():
+        for run in folders if is_main_process() else ():
             held.enter_context(store.lock(run, new=not resume))
             store.remove_unfinished(run)
         before = config_io.load(folders[0] / "config.yaml") if resume else config
@@ -115,16 +115,16 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Ro
     trajectories = stacked(episodes, task)
     # Before this episode teaches the model, and after another has. No first trial should wait for the compiler.
     judged = trial > max(1, config.explore.trials)
-    calibration = fetched(program("calibrate", states, trajectories)) if judged else np.full(len(episodes), np.nan)
+    calibration = gather(program("calibrate", states, trajectories)) if judged else np.full(len(episodes), np.nan)
     # Line 4: add the episode to the data.
     states, found = program("add_episode", states, trajectories), [UNKNOWN] * len(episodes)
     # Lines 5 and 6: fit the model, search a policy; not where the next episode is random too, and needs no policy.
     if trial >= config.explore.trials:
         states, found = improved(job, states, trial, trajectories)
     job.display.phase(trial, "evaluate", 0.9)
-    keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(fetched(states.key))
-    evaluation = evaluate(keys, states.policy.params, task, program, config.evaluation)
-    sizes, seconds = np.asarray(fetched(states.data.size)), program.seconds()
+    keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(gather(states.key))
+    evaluation = evaluate(keys, states.policy.params, task, program, config.eval_episodes)
+    sizes, seconds = np.asarray(gather(states.data.size)), program.seconds()
     return states, [
         {
             "trial": trial,
@@ -153,7 +153,7 @@ def improved(job: Job, states: RunState, trial: int, trajectories: Trajectory) -
     phase(trial, "fit", 0.02)
     incumbents = states.policy.params
     states, fitted = program("fit", states)
-    fitted = fetched(fitted)
+    fitted = gather(fitted)
     if not np.isfinite(fitted.loss).any():
         loss = float(fitted.loss[0])
         job.writer.problem(f"trial {trial}: the loss of the model's fit is {loss}, so nothing was learned")
@@ -162,7 +162,7 @@ def improved(job: Job, states: RunState, trial: int, trajectories: Trajectory) -
         cost = np.mean(found[-1].objective[:, -1]) if found else None
         phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)
         states, searched = program("search", states, jnp.int32(i * program.chunk))
-        found.append(jax.tree.map(np.asarray, fetched(searched)))
+        found.append(jax.tree.map(np.asarray, gather(searched)))
         program.prepare("succeed", incumbents)  # once; not before the first of the search, for which everybody waits
         program.prepare("calibrate", trajectories)
     objective, norm = (np.concatenate([getattr(f, name) for f in found], 1) for name in ("objective", "gradient_norm"))
@@ -171,7 +171,7 @@ def improved(job: Job, states: RunState, trial: int, trajectories: Trajectory) -
         job.writer.problem(f"trial {trial}: {lost}, so nothing was learned")
     skipped = fitted.skipped + sum(f.skipped for f in found)
     states, successor = program("succeed", states, incumbents, purpose="imagine")
-    successor = fetched(successor)
+    successor = gather(successor)
     job.writer.imagined(trial, successor)
     return states, [
         {

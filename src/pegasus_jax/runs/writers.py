@@ -15,7 +15,7 @@ import jax
 from pegasus_jax.checks import RunError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import checkpoint, config_io, store
-from pegasus_jax.runs.programs import fetched, leads
+from pegasus_jax.runs.programs import gather, is_main_process
 from pegasus_jax.runs.tensorboard import Board
 from pegasus_jax.types import Episode, RunState, Successor, Task
 
@@ -58,22 +58,22 @@ def run_folders(runs: dict[int, Path], config: Config, task: Task, command: str,
     boards: list[Board] = []
 
     def begin(done: int) -> None:
-        for seed, run in runs.items() if leads() else ():
+        for seed, run in runs.items() if is_main_process() else ():
             config_io.save(replace(config, seed=seed), run / "config.yaml")
             store.note(run, command, done, task)
             store.write_trials(run, store.readable_trials(run)[0][:done])
             boards.append(Board(run / "tensorboard", done + 1, say))
 
     def episode(index: int, trial: int, ran: Episode, policy: int) -> None:
-        if leads() and len(ran.trajectory.u):
+        if is_main_process() and len(ran.trajectory.u):
             store.save_episode(folders[index], trial, ran.trajectory, task, policy=policy, ended=ran.ended)
 
     def imagined(trial: int, successor: Successor) -> None:
-        for index, run in enumerate(folders if leads() else ()):
+        for index, run in enumerate(folders if is_main_process() else ()):
             store.save_imagined(run, trial, part(successor.rollout, index), successor.cost[index])
 
     def trial(number: int, states: RunState, rows: list[Row]) -> None:
-        whole = fetched(states)
+        whole = gather(states)
         for index, board in enumerate(boards):
             store.write_trials(folders[index], [*store.trials(folders[index]), rows[index]])
             board.add(rows[index])

@@ -8,7 +8,7 @@ import numpy as np
 from pegasus_jax.studies.comparison import Result, results, stored
 from pegasus_jax.studies.figures import Claim, Figure
 from pegasus_jax.studies.study import SOLVED, first_solved
-from pegasus_jax.viz.learning_curves import interval, middle
+from pegasus_jax.viz.learning_curves import interval, iqm
 
 MISSING = "not run yet"
 SAME = 0.05  # a difference in mean cost a step that nobody would choose a variant for: from 1.0 to 0.3 is to be learned
@@ -32,7 +32,7 @@ class Judged(NamedTuple):
     verdict: str
 
 
-def judge(claim: Claim, figure: Figure, out: Path) -> Judged:
+def test_claim(claim: Claim, figure: Figure, out: Path) -> Judged:
     """What the studies in `out` say to a claim, by 95 % bootstrap intervals of interquartile means over seeds.
 
     Of two variants: agrees or contradicts where the interval of the difference leaves out 0; where it does not, no
@@ -46,12 +46,12 @@ def judge(claim: Claim, figure: Figure, out: Path) -> Judged:
     if isinstance(second, Costs):
         low, high = interval(first.mean, second.mean, paired=first.seeds == second.seeds)
         neither = "no difference" if max(-low, high) <= SAME else "undecided"
-        words, other = ("agrees", neither, "contradicts"), middle(second.mean)
+        words, other = ("agrees", neither, "contradicts"), iqm(second.mean)
     else:
         low, high = (end - second for end in interval(first.mean))
         words, other = ("beats", "reaches", "misses"), second
     verdict = words[0] if high < 0 else words[2] if low > 0 else words[1]
-    difference = f"{middle(first.mean) - other:+.3f} [{low:+.3f}, {high:+.3f}]"
+    difference = f"{iqm(first.mean) - other:+.3f} [{low:+.3f}, {high:+.3f}]"
     return Judged(claim, estimate(first), estimate(second), difference, verdict)
 
 
@@ -73,7 +73,7 @@ def estimate(value: Costs | float | None) -> str:
 def middling(values: np.ndarray) -> str:
     """Interquartile mean of seeds [S] and its interval."""
     low, high = interval(values)
-    return f"{middle(values):.3f} [{low:.3f}, {high:.3f}]" if len(values) > 1 else f"{values[0]:.3f}"
+    return f"{iqm(values):.3f} [{low:.3f}, {high:.3f}]" if len(values) > 1 else f"{values[0]:.3f}"
 
 
 def variants_table(figure: Figure, out: Path) -> list[list[str]]:
@@ -107,7 +107,7 @@ def claims_table(figure: Figure, out: Path) -> list[list[str]]:
     """A header and a row for each claim."""
     rows = []
     for claim in figure.claims:
-        judged = judge(claim, figure, out)
+        judged = test_claim(claim, figure, out)
         first, last = claim.trials
         span = f"trial {first}" if first == last else f"trials {first} to {last}"
         than = claim.than if isinstance(claim.than, str) else "published"

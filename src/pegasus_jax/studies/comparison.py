@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from pegasus_jax.assembly.experiments import build
-from pegasus_jax.checks import ConfigError, RunError, nearest
+from pegasus_jax.checks import ConfigError, RunError, did_you_mean
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
@@ -34,7 +34,7 @@ def configs(figure: Figure, changes: Sequence[str] = ()) -> dict[str, Config]:
         try:
             words = [f"trials={figure.trials}", *shlex.split(figure.common), *shlex.split(own), *changes]
             config = config_io.parse(config_io.split(words)[1], options=OPTIONS)
-            with jax.enable_x64(config.precision == "double"):
+            with jax.enable_x64(config.x64):
                 build(config)  # so that impossible settings end here, before an hour's work
         except ValueError as error:  # a ConfigError is one
             raise ConfigError(f"figure {figure.name}, variant {label}: {error}") from error
@@ -51,7 +51,9 @@ def run(
     """
     for label in only:
         if label not in figure.variants:
-            raise ConfigError(f"{label} is not a variant of figure {figure.name}; {nearest(label, figure.variants)}")
+            raise ConfigError(
+                f"{label} is not a variant of figure {figure.name}; {did_you_mean(label, figure.variants)}"
+            )
     chosen, wanted = seed_list(seeds or figure.seeds), configs(figure, changes)
     try:
         out.mkdir(parents=True, exist_ok=True)

@@ -9,8 +9,8 @@ picture = "area"                                                # optional; "cur
 common = "algorithm=paper"                                      # settings of every variant, as on a command line
 
 [variants]                                                      # label = its own settings
-none = "search.clip=null"
-"1" = "search.clip=1"
+none = "search.grad_clip=null"
+"1" = "search.grad_clip=1"
 
 [[claims]]                                                      # optional: what the numbers should show
 says = "clipping beats none"
@@ -24,7 +24,7 @@ import tomllib
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax.checks import ConfigError, nearest
+from pegasus_jax.checks import ConfigError, did_you_mean
 
 
 class Claim(NamedTuple):
@@ -71,13 +71,17 @@ def read(path: Path) -> Figure:
     try:
         said = tomllib.loads(path.read_text())
     except OSError as error:
-        near = nearest(path.stem, [p.stem for p in sorted(path.parent.glob("*.toml"))]) if path.parent.is_dir() else ""
+        near = (
+            did_you_mean(path.stem, [p.stem for p in sorted(path.parent.glob("*.toml"))])
+            if path.parent.is_dir()
+            else ""
+        )
         raise ConfigError(f"{path} cannot be read: {error.strerror}" + (f"; {near}" if near else "")) from error
     except ValueError as error:
         raise ConfigError(f"{path} is not TOML: {error}") from error
     for key, value in said.items():
         if key not in KINDS:
-            raise ConfigError(f"{path}: {key} is not a key of a figure; {nearest(key, KINDS)}")
+            raise ConfigError(f"{path}: {key} is not a key of a figure; {did_you_mean(key, KINDS)}")
         if not isinstance(value, KINDS[key]) or isinstance(value, bool):
             raise ConfigError(f"{path}: {key}={value} is not {_article(KINDS[key])}")
     for key in NEEDED:
@@ -85,11 +89,11 @@ def read(path: Path) -> Figure:
             raise ConfigError(f"{path}: {key} is missing")
     for label, words in said["variants"].items():
         if not isinstance(words, str):
-            raise ConfigError(f'{path}: variant {label} is not a text of settings; for example "search.clip=1"')
+            raise ConfigError(f'{path}: variant {label} is not a text of settings; for example "search.grad_clip=1"')
         if not re.fullmatch(r"[\w.-]+", label):
             raise ConfigError(f"{path}: variant '{label}' cannot be part of a file's name; letters, digits, . _ -")
     if said.get("picture", "curves") not in PICTURES:
-        raise ConfigError(f"{path}: picture={said['picture']} is unknown; {nearest(said['picture'], PICTURES)}")
+        raise ConfigError(f"{path}: picture={said['picture']} is unknown; {did_you_mean(said['picture'], PICTURES)}")
     claims = tuple(_claim(path, claim) for claim in said.get("claims", ()))
     fields: dict[str, Any] = (
         dict(paper="", found="", seeds="0-9", picture="curves", common="") | said | {"claims": claims}

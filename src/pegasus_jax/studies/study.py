@@ -32,8 +32,8 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
     """
     if config.task == GYM:
         raise ConfigError("task=gym cannot be studied as one program: its environment is one object; use pegasus-train")
-    if not config.evaluation:
-        raise ConfigError("evaluation=0 leaves a study nothing to compare; the nearest is 1")
+    if not config.eval_episodes:
+        raise ConfigError("eval_episodes=0 leaves a study nothing to compare; the nearest is 1")
     result: dict[str, Any] = {}
 
     def keep(latest: dict[str, Any]) -> None:
@@ -74,14 +74,14 @@ def curves(config: Config, seeds: list[int], trials: list[list[Row]], task: Task
     return {
         "seeds": seeds,
         "plant_seconds": np.round(task.horizon * task.dt * np.arange(1, len(trials) + 1), 6).tolist(),
-        **{name: short(of(name)) for name in ROUNDED},
+        **{name: rounded(of(name)) for name in ROUNDED},
         "success_rate": of("success_rate"),
         "skipped_updates": of("skipped_updates"),
         "config": config_io.plain(config),
     }
 
 
-def short(values: Any) -> list[list[float | None]]:
+def rounded(values: Any) -> list[list[float | None]]:
     """Numbers [S, T] to four decimals; None for one that is not known, because JSON has no NaN."""
     return [[None if np.isnan(v) else round(float(v), 4) for v in row] for row in np.asarray(values, float)]
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pegasus_jax import interrupt
-from pegasus_jax.checks import ConfigError, nearest
+from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
 from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
 from pegasus_jax.math import circles
@@ -42,7 +42,7 @@ def of_plant(name: str, plant: "Plant") -> Task:
         control_names=plant.control_names,
         rates=plant.rates,
         expected_cost=expected_saturating(plant.error, plant.width, plant.angles),
-        widened=partial(widened, plant.error, plant.width, plant.angles),
+        cost_with_width=partial(widened, plant.error, plant.width, plant.angles),
     )
 
 
@@ -75,13 +75,13 @@ TASKS: dict[str, Callable[[Any], "Plant"]] = {
 def make(name: str, legs: int = 2) -> Task:
     """The task of that name; only the swimmer has legs. Raises ConfigError for an unknown one."""
     if name not in TASKS:
-        raise ConfigError(f"task={name} is unknown; {nearest(name, TASKS)}")
+        raise ConfigError(f"task={name} is unknown; {did_you_mean(name, TASKS)}")
     return of_plant(name, TASKS[name](legs))
 
 
 def of_config(config: Config) -> Task:
     """The task that a config names."""
-    own = {GYM: of_gym, MJCF: of_mjcf}
+    own = {GYM: from_gym, MJCF: from_mjcf}
     return own[config.task](config) if config.task in own else make(config.task, config.legs)
 
 
@@ -100,8 +100,9 @@ def known_sensors(task: Task) -> np.ndarray:
     """The std [D] of a task's sensors. Raises ConfigError where it is not known."""
     if not np.any(task.sensor_std):
         raise ConfigError(
-            f"search.sensors=known needs a plant whose sensors' noise is known, and that of task={task.name} is not;"
-            " the nearest is search.sensors=predicted"
+            f"search.observation_noise=plant needs a plant whose sensors' noise is known,"
+            f" and that of task={task.name} is not;"
+            " the nearest is search.observation_noise=model"
         )
     return np.asarray(task.sensor_std, float)
 
@@ -117,7 +118,7 @@ def input_scale(task: Task, units: tuple[float, ...]) -> Any:
     return np.concatenate([1 / np.array(units), np.ones(2 * len(task.angles))]) if units else 1.0
 
 
-def pinned(config: Config) -> Config:
+def resolve(config: Config) -> Config:
     """The config for a run's folder: it finds its MJCF file from anywhere.
 
     That of a Gymnasium environment says all that has to be known of it, so that whoever reads the folder, or goes on
@@ -148,14 +149,14 @@ def pinned(config: Config) -> Config:
     return dataclasses.replace(config, mjcf=os.path.abspath(config.mjcf))
 
 
-def of_gym(config: Config) -> Task:
+def from_gym(config: Config) -> Task:
     """The task that a Gymnasium environment and a cost of its observations pose. Raises ConfigError if they cannot."""
     from pegasus_envs.gym_plant import EnvSpec, env_plant
 
     _complete(config)
     known: dict[str, Any] = {name: getattr(config, name) for name in EnvSpec._fields}
     if any(value in (None, ()) for name, value in known.items() if name != "starts"):
-        return of_gym(pinned(config))
+        return from_gym(resolve(config))
     known |= {name: np.array(value, float) for name, value in known.items() if isinstance(value, tuple)}
     name, about = config.env or "", EnvSpec(**known)
     states = tuple(f"x{i}" for i in range(len(about.start_mean)))
@@ -265,7 +266,7 @@ def environment(config: Config) -> Any:
         interrupt.reclaim()
 
 
-def of_mjcf(config: Config) -> Task:
+def from_mjcf(config: Config) -> Task:
     """The task that an MJCF file and a cost of its observations pose. Raises ConfigError if they cannot."""
     if None in (config.mjcf, config.cost, config.dt, config.horizon):
         raise ConfigError(

@@ -13,7 +13,7 @@ from traceback import extract_tb
 from types import ModuleType
 from typing import Any
 
-from pegasus_jax.checks import ConfigError, nearest
+from pegasus_jax.checks import ConfigError, did_you_mean
 
 STANDARD = tuple(sysconfig.get_paths()[name] for name in ("stdlib", "platstdlib"))
 INSTALLED = ("site-packages", "dist-packages")
@@ -37,7 +37,7 @@ def load(setting: str, name: str, not_from: Path | None = None) -> Callable[...,
         value = getattr(found, function, None)
     if value is None:
         names = [n for n in vars(found) if not n.startswith("_")]
-        hint = nearest(function, names).partition("choices:")[0].strip() or f"expected {setting}=module:function"
+        hint = did_you_mean(function, names).partition("choices:")[0].strip() or f"expected {setting}=module:function"
         raise ConfigError(f"{what} cannot be imported: {origin(module) or module} has no {function}; {hint}")
     if not callable(value):
         raise ConfigError(f"{what} is not a function, but of type {type(value).__name__}: {origin(module)}")

@@ -24,7 +24,9 @@ def seeds_picture(runs: Sequence[Path], path: Path) -> Path:
     if not shared:
         raise RunError(f"{runs[0].parent}: not every run has a finished trial yet")
     if any(row["mean_cost"] is None for run in rows for row in run[:shared]):
-        raise RunError(f"{runs[0].parent}: these runs were not evaluated (evaluation=0); pegasus-plot draws each alone")
+        raise RunError(
+            f"{runs[0].parent}: these runs were not evaluated (eval_episodes=0); pegasus-plot draws each alone"
+        )
     cost, success = ([[row[name] for row in run[:shared]] for run in rows] for name in ("mean_cost", "success_rate"))
     picture(
         {f"{len(runs)} seeds": (np.asarray(cost), np.asarray(success))}, [r["plant_seconds"] for r in rows[0]], path
@@ -51,7 +53,7 @@ def picture(
 def curves(axis: Axes, x: list[float], values: np.ndarray, color: str, label: str) -> None:
     """Raw curves [S, T] thin; interquartile mean over seeds thick, with its 95 % bootstrap interval."""
     axis.plot(x, values.T, color=color, lw=0.5, alpha=0.4)
-    axis.plot(x, middle(values), color=color, lw=2, label=label)
+    axis.plot(x, iqm(values), color=color, lw=2, label=label)
     if values.shape[0] > 2:
         axis.fill_between(x, *interval(values), color=color, alpha=0.2, lw=0)
     axis.grid(alpha=0.25)
@@ -70,7 +72,7 @@ def areas_picture(
         areas = cost[:, :shared].mean(1)
         spread = 0.25 * (np.arange(areas.size) / max(areas.size - 1, 1) - 0.5)  # so that no dot hides another
         axis.plot(x + spread, areas, "o", color="C0", ms=4, alpha=0.5, mew=0)
-        axis.plot([x - 0.25, x + 0.25], 2 * [middle(areas)], color="C0", lw=2)
+        axis.plot([x - 0.25, x + 0.25], 2 * [iqm(areas)], color="C0", lw=2)
         if areas.size > 2:
             axis.fill_between([x - 0.25, x + 0.25], *interval(areas), color="C0", alpha=0.2, lw=0)
     axis.set_xticks(range(len(results)), list(results))
@@ -83,7 +85,7 @@ def areas_picture(
     plt.close(figure)
 
 
-def middle(values: np.ndarray, axis: int = 0) -> np.ndarray:
+def iqm(values: np.ndarray, axis: int = 0) -> np.ndarray:
     """The interquartile mean over seeds, the first axis."""
     return trim_mean(values, 0.25, axis=axis)
 
@@ -98,7 +100,7 @@ def interval(*samples: np.ndarray, paired: bool = False) -> tuple[np.ndarray, np
         return np.full(samples[0].shape[1:], -np.inf), np.full(samples[0].shape[1:], np.inf)
 
     def statistic(first: np.ndarray, *second: np.ndarray, axis: int) -> np.ndarray:
-        return middle(first, axis) - sum(middle(other, axis) for other in second)
+        return iqm(first, axis) - sum(iqm(other, axis) for other in second)
 
     options: dict = dict(axis=0, n_resamples=2000, method="percentile", paired=paired, rng=np.random.default_rng(0))
     found = bootstrap(samples, statistic, **options).confidence_interval

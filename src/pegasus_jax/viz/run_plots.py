@@ -54,7 +54,7 @@ def learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
     top.legend(frameon=False)
     bottom.plot(seconds, [row["success_rate"] for row in rows], "o-", color=REAL)
     if not measured:
-        bottom.text(0.5, 0.5, "not measured: evaluation=0", transform=bottom.transAxes, ha="center", va="center")
+        bottom.text(0.5, 0.5, "not measured: eval_episodes=0", transform=bottom.transAxes, ha="center", va="center")
     bottom.set(ylabel="success rate", xlabel="plant time [s]", ylim=(-0.03, 1.03))
     for axis in (top, bottom):
         axis.grid(alpha=0.25)
