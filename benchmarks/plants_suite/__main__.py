@@ -1,0 +1,117 @@
+"""How many seeds learn plants that nobody here wrote, with the preset that the documents name, after how much time.
+
+    python -m benchmarks.plants_suite [plants=[Pendulum-v1,...]] [seeds=100-109] [jobs=2] [out=FILE] [minutes=60]
+        [setting=value ...]
+
+Runs `pegasus-train` once for each plant and seed, `jobs` at a time with one core each, then judges the policy after
+every trial by the environment's own reward (native.py). Writes one JSON, again after each run, and prints one table.
+The runs are in OUT without .json: the same command goes on with those that were stopped, by hand or after `minutes`.
+Tuning seeds are 100 to 119; 200 and above are for a final judgment only. Other settings are for all plants alike.
+"""
+
+import json
+import os
+import shlex
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+from benchmarks.plants_suite.plants import PLANTS
+from pegasus_jax.checks import ConfigError, nearest
+from pegasus_jax.cli.sweep import PROGRAM
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.files import write_json
+from pegasus_jax.runs.machine import about
+from pegasus_jax.studies.study import seed_list
+
+ROOT = Path(__file__).parents[2]
+ONE_CORE = {
+    **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+    "JAX_PLATFORMS": "cpu",
+    "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
+    "PYTHONPATH": os.pathsep.join(str(ROOT / name) for name in ("src", "envs", "")),
+}
+SHARES = (0.25, 0.5, 0.75, 1.0)  # of the time by which a plant is to be learned, at which the table looks
+
+
+def one(name: str, seed: int, home: Path, words: Sequence[str], minutes: float, cores: Any) -> dict[str, Any]:
+    """One run, learned or gone on with, and what its policies are worth; `error` is the last line of a failure."""
+    plant, run, core, began = PLANTS[name], (home / f"{name}-{seed}").absolute(), cores.get(), time.monotonic()
+    new = [f"env={plant.env}", *plant.words, f"seed={seed}", f"trials={plant.trials}", "evaluation=0", f"out={run}"]
+    task = [f"resume={run}"] if (run / "config.yaml").exists() else ["task=gym", *new, *words]
+    learned = on_core([*PROGRAM, *task], core, 60 * minutes)
+    judged = on_core([sys.executable, "-m", "benchmarks.plants_suite.native", str(run), plant.env], core, None)
+    cores.put(core)
+    rows = json.loads(judged[0].splitlines()[-1]) if judged[1] is None else []
+    seconds, error = round(time.monotonic() - began, 1), learned[1] or judged[1]
+    print(f"{name} seed {seed}, {seconds:.0f} s: {[row['native'] for row in rows]} {error or ''}", flush=True)
+    return {"plant": name, "seed": seed, "seconds": seconds, "error": error, "trials": rows}
+
+
+def on_core(command: list[str], core: int | None, limit: float | None) -> tuple[str, str | None]:
+    """What a command printed, and the last line of its error or None; it is interrupted after `limit` seconds."""
+    pin = ["taskset", "-c", str(core)] if core is not None and shutil.which("taskset") else []
+    pipes: dict[str, Any] = dict(stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    with subprocess.Popen([*pin, *command], cwd=ROOT, env=os.environ | ONE_CORE, **pipes) as process:
+        try:
+            said, failed = process.communicate(timeout=limit)
+        except subprocess.TimeoutExpired:
+            process.terminate()
+            said, failed = process.communicate()
+    return said, None if process.returncode == 0 else (failed.strip().splitlines() or ["no message"])[-1]
+
+
+def share(runs: Sequence[dict[str, Any]], bar: float, until: float) -> float:
+    """The share of runs whose newest policy within so many seconds of plant time has a native return at the bar."""
+    newest = [[row["native"] for row in run["trials"] if row["plant_seconds"] <= until + 1e-6] for run in runs]
+    return sum(bool(values) and values[-1] >= bar for values in newest) / max(1, len(runs))
+
+
+def table(runs: Sequence[dict[str, Any]]) -> str:
+    """A row for each plant: the share of its seeds at the bar, after parts of the time for it and at the end."""
+    lines = [
+        f"{'plant':28}{'bar':>8}{'by [s]':>8}{'seeds':>7}" + "".join(f"{f'{s:.0%}':>7}" for s in SHARES) + "    end"
+    ]
+    for name, plant in PLANTS.items():
+        if own := [run for run in runs if run["plant"] == name]:
+            at = [*(part * plant.by for part in SHARES), float("inf")]
+            shares = "".join(f"{share(own, plant.bar, until):7.0%}" for until in at)
+            lines.append(f"{name:28}{plant.bar:8g}{plant.by:8g}{len(own):7}{shares}")
+    return "\n".join(lines)
+
+
+def main(given: list[str]) -> None:
+    """The command line of this module. Raises ConfigError for plants and seeds that are not for this."""
+    options, rest = config_io.split(given, ("plants", "seeds", "jobs", "out", "minutes"))
+    names = options["plants"].strip("[]").split(",") if "plants" in options else [*PLANTS]
+    seeds = seed_list(options.get("seeds", "100-109").strip("[]"))
+    if wrong := [name for name in names if name not in PLANTS]:
+        raise ConfigError(f"plants={wrong[0]} is unknown; {nearest(wrong[0], PLANTS)}")
+    out = Path(options.get("out", "runs/plants_suite.json")).absolute()
+    jobs, minutes = int(options.get("jobs", "2")), float(options.get("minutes", "60"))
+    own = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    cores: SimpleQueue[int | None] = SimpleQueue()
+    for job in range(jobs):
+        cores.put(own[job % len(own)] if own else None)
+    told = about(shlex.join(["python", "-m", "benchmarks.plants_suite", *given]))
+    (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
+    words, runs = [f"{key}={value}" for key, value in rest.items()], list[dict[str, Any]]()
+    with ThreadPoolExecutor(jobs) as pool:
+        jobs_of = [pool.submit(one, name, seed, home, words, minutes, cores) for seed in seeds for name in names]
+        for job in as_completed(jobs_of):
+            runs.append(job.result())
+            write_json(out, {"runs": runs, "about": told})
+    print(table(runs))
+
+
+if __name__ == "__main__":
+    try:
+        main(sys.argv[1:])
+    except ConfigError as error:
+        sys.exit(f"plants_suite: {error}")

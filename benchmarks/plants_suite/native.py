@@ -1,0 +1,49 @@
+"""The native return of each policy of a run: the environment's own reward, time limit, starts and end.
+
+    python -m benchmarks.plants_suite.native RUN ENV
+
+prints one JSON row for each trial: the returns and the lengths of 10 episodes, whose resets have fixed seeds.
+"""
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from pegasus_jax import controller
+from pegasus_jax.runs import checkpoint, store
+
+EPISODES, FIRST_RESET = 10, 10_000
+
+
+def returns(control: Any, env: Any, episodes: int = EPISODES) -> tuple[list[float], list[int]]:
+    """The return and the length of each episode of `control`, observation -> control."""
+    totals, lengths = [], []
+    for episode in range(episodes):
+        x, _ = env.reset(seed=FIRST_RESET + episode)
+        total, length, over = 0.0, 0, False
+        while not over:
+            x, reward, terminated, truncated, _ = env.step(control(x).astype(env.action_space.dtype))
+            total, length, over = total + float(reward), length + 1, terminated or truncated
+        totals.append(round(total, 3))
+        lengths.append(length)
+    return totals, lengths
+
+
+def scores(run: Path, name: str) -> list[dict[str, Any]]:
+    """One row for each trial that has a policy and a row of its own."""
+    env, rows = gymnasium.make(name), []
+    for row in store.trials(run):
+        if row["trial"] not in checkpoint.available(run):
+            continue
+        totals, lengths = returns(controller(run, trial=row["trial"]), env)
+        told = {key: row[key] for key in ("trial", "plant_seconds", "policy", "episode_cost", "objective_fresh")}
+        rows.append(told | {"native": round(float(np.mean(totals)), 3), "returns": totals, "lengths": lengths})
+    return rows
+
+
+if __name__ == "__main__":
+    print(json.dumps(scores(Path(sys.argv[1]), sys.argv[2])))

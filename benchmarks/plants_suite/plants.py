@@ -1,0 +1,31 @@
+"""The plants as data: what a user knows of each. No setting of a model or a search is here."""
+
+from typing import NamedTuple
+
+
+def task(horizon: int, cost: str, stop: str = "", angles: str = "[]") -> tuple[str, ...]:
+    """The words of pegasus-train that describe a task, with functions of costs.py."""
+    named = {"cost": cost, "stop": stop}
+    functions = (f"{setting}=benchmarks.plants_suite.costs:{name}" for setting, name in named.items() if name)
+    return (f"horizon={horizon}", f"angles={angles}", *functions)
+
+
+class Plant(NamedTuple):
+    """A Gymnasium environment, and what its own return has to be."""
+
+    env: str
+    words: tuple[str, ...]
+    trials: int
+    bar: float  # of the native return, mean of 10 episodes
+    by: float  # plant time at which the bar is to be reached [s]
+
+
+IP, IDP = "InvertedPendulum-v5", "InvertedDoublePendulum-v5"
+PLANTS: dict[str, Plant] = {
+    "Pendulum-v1": Plant("Pendulum-v1", task(40, "pendulum"), 12, -200.0, 16.0),
+    IP: Plant(IP, task(50, "inverted_pendulum", "inverted_pendulum_falls", angles="[1]"), 20, 950.0, 30.0),
+    IDP: Plant(IDP, task(40, "double_pendulum", "double_pendulum_falls"), 30, 8500.0, 60.0),
+    "Reacher-v5": Plant("Reacher-v5", task(50, "reacher"), 60, -6.0, 60.0),
+    # Its return is minus the sum of the cost: a swing-up that holds has some -11, a slow one that never holds -16.
+    "CartPole": Plant("pegasus_envs:pegasus/CartPoleSwingUp-v0", task(25, "cartpole", angles="[3]"), 15, -12.5, 20.0),
+}

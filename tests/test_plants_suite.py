@@ -1,0 +1,101 @@
+"""The suite of plants that nobody here wrote: what its user wrote is true of them, and one seed goes through it."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import pegasus_envs  # noqa: F401 (registers the cart-pole)
+from benchmarks.plants_suite.__main__ import main, share, table
+from benchmarks.plants_suite.native import returns
+from benchmarks.plants_suite.plants import PLANTS
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.tasks import user_code
+
+
+def function(name: str, setting: str) -> Any:
+    """What a plant's words name for `cost` or `stop`; None where they name nothing."""
+    words = dict(word.split("=", 1) for word in PLANTS[name].words)
+    return jax.jit(user_code.load(setting, words[setting])) if setting in words else None
+
+
+@pytest.mark.parametrize("name", [name for name in PLANTS if function(name, "stop") is not None])
+def test_episodes_end_where_their_user_says(name: str) -> None:
+    stop, env = function(name, "stop"), gymnasium.make(PLANTS[name].env)
+    env.action_space.seed(0)
+    ends = 0
+    for seed in range(20):
+        env.reset(seed=seed)
+        for _ in range(200):
+            x, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            assert (stop(jnp.asarray(x)) > 0.5) == terminated, x
+            if terminated or truncated:
+                ends += terminated
+                break
+    assert ends == 20
+
+
+@pytest.mark.parametrize(
+    ("name", "goal"),
+    [
+        ("Pendulum-v1", [1, 0, 0]),
+        ("InvertedPendulum-v5", [0, 0, 0, 0]),
+        ("InvertedDoublePendulum-v5", [0, 0, 0, 1, 1, 0, 0, 0, 0]),
+        ("Reacher-v5", [1, 1, 0, 0, 0.2, 0, 0, 0, 0, 0]),
+        ("CartPole", [0, 0, 0, np.pi]),
+    ],
+)
+def test_a_cost_is_least_at_the_goal(name: str, goal: list[float]) -> None:
+    cost, env = function(name, "cost"), gymnasium.make(PLANTS[name].env)
+    assert cost(jnp.array(goal, float)) == pytest.approx(0, abs=1e-6)
+    starts = [cost(jnp.asarray(env.reset(seed=seed)[0], float)) for seed in range(5)]
+    assert 0 < min(starts) <= max(starts) <= 1
+
+
+def test_the_cart_pole_is_the_projects_own() -> None:
+    cost, env = function("CartPole", "cost"), gymnasium.make(PLANTS["CartPole"].env)
+    env.reset(seed=0)
+    for u in np.linspace(-10, 10, 8, dtype=np.float32):
+        *_, info = env.step(u[None])
+        assert cost(jnp.asarray(info["x"])) == pytest.approx(info["cost"], abs=1e-5)
+
+
+def test_native_returns_are_those_of_the_environment() -> None:
+    """A controller that does nothing, against the environment's own reward, again with the same resets."""
+    env = gymnasium.make("Pendulum-v1")
+    totals, lengths = returns(lambda x: np.zeros(1), env, 2)
+    assert lengths == [200, 200]
+    env.reset(seed=10_001)
+    assert totals[1] == pytest.approx(sum(env.step(np.zeros(1, np.float32))[1] for _ in range(200)), abs=1e-3)
+
+
+def test_shares_count_the_newest_policy_of_each_seed() -> None:
+    def run(*native: float) -> dict[str, Any]:
+        rows = [{"native": value, "plant_seconds": 2.0 * trial} for trial, value in enumerate(native, start=1)]
+        return {"plant": "Pendulum-v1", "trials": rows}
+
+    runs = [run(-900, -100), run(-100, -900), run(-100), run()]
+    assert [share(runs, -200, until) for until in (1, 2, 4)] == [0, 0.5, 0.5]
+    assert "Pendulum-v1" in table(runs)
+
+
+def test_a_plant_that_is_not_there_is_one_line() -> None:
+    with pytest.raises(ConfigError, match="plants=Pendulum is unknown; did you mean"):
+        main(["plants=[Pendulum]"])
+
+
+def test_one_seed_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["fit.steps=5", "search.steps=5", "model.hidden=[8]", "policy.hidden=[8]", "trials=1"]
+    main(["plants=[Pendulum-v1]", "seeds=[100]", "jobs=1", f"out={tmp_path / 'suite.json'}", *words])
+    (run,) = json.loads((tmp_path / "suite.json").read_text())["runs"]
+    assert (run["plant"], run["seed"], run["error"]) == ("Pendulum-v1", 100, None)
+    (row,) = run["trials"]
+    assert row["native"] == pytest.approx(np.mean(row["returns"]), abs=1e-3)
+    assert len(row["returns"]) == 10
+    assert row["plant_seconds"] == pytest.approx(2)
+    assert "Pendulum-v1" in capsys.readouterr().out
