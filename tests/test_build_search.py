@@ -197,7 +197,7 @@ def test_an_annealing_search_goes_on_where_that_of_the_trial_before_ended():
         steps=2, learning_rate=1e-4, cost_width_start=2.0, decay=0.0, anneal_trials=2, period=Period(0, 0, 0, 0, 0)
     )
     _, state, run = searcher(**course)
-    _, _, plain = searcher(**{**course, "widen": 1.0, "learning_rate": 1e-30, "anneal": 1})
+    _, _, plain = searcher(**{**course, "cost_width_start": 1.0, "learning_rate": 1e-30, "anneal_trials": 1})
     moved = []
     for trial, wider in ((1, True), (2, False), (3, False)):
         now = state._replace(trial=jnp.int32(trial))

@@ -93,7 +93,7 @@ def test_after_annealed_searches_each_has_its_own_step_size_and_limit():
 def test_a_table_can_be_read_without_jax():
     code = (
         "import sys; from pegasus_jax.learn.schedule import search_table, text;"
-        "print(text(search_table(2, init='better', refine=1, widen=2))); assert 'jax' not in sys.modules"
+        "print(text(search_table(2, init='better', refine=1, cost_width_start=2))); assert 'jax' not in sys.modules"
     )
     lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()
     assert lines[0].split() == ["iteration", "scenarios", "action", "candidate", "refine", "width", "step", "limit"]

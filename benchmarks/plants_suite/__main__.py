@@ -23,7 +23,7 @@ from queue import SimpleQueue
 from typing import Any
 
 from benchmarks.plants_suite.plants import PLANTS
-from pegasus_jax.checks import ConfigError, nearest
+from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.cli.sweep import PROGRAM
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.files import write_json
@@ -43,7 +43,7 @@ SHARES = (0.25, 0.5, 0.75, 1.0)  # of the time by which a plant is to be learned
 def one(name: str, seed: int, home: Path, words: Sequence[str], minutes: float, cores: Any) -> dict[str, Any]:
     """One run, learned or gone on with, and what its policies are worth; `error` is the last line of a failure."""
     plant, run, core, began = PLANTS[name], (home / f"{name}-{seed}").absolute(), cores.get(), time.monotonic()
-    new = [f"env={plant.env}", *plant.words, f"seed={seed}", f"trials={plant.trials}", "evaluation=0", f"out={run}"]
+    new = [f"env={plant.env}", *plant.words, f"seed={seed}", f"trials={plant.trials}", "eval_episodes=0", f"out={run}"]
     task = [f"resume={run}"] if (run / "config.yaml").exists() else ["task=gym", *new, *words]
     learned = on_core([*PROGRAM, *task], core, 60 * minutes)
     judged = on_core([sys.executable, "-m", "benchmarks.plants_suite.native", str(run), plant.env], core, None)
@@ -92,7 +92,7 @@ def main(given: list[str]) -> None:
     names = options["plants"].strip("[]").split(",") if "plants" in options else [*PLANTS]
     seeds = seed_list(options.get("seeds", "100-109").strip("[]"))
     if wrong := [name for name in names if name not in PLANTS]:
-        raise ConfigError(f"plants={wrong[0]} is unknown; {nearest(wrong[0], PLANTS)}")
+        raise ConfigError(f"plants={wrong[0]} is unknown; {did_you_mean(wrong[0], PLANTS)}")
     out = Path(options.get("out", "runs/plants_suite.json")).absolute()
     jobs, minutes = int(options.get("jobs", "2")), float(options.get("minutes", "60"))
     own = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
