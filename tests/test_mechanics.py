@@ -1,4 +1,4 @@
-"""The mechanism's GPU kernel, interpreted, against the plain form: values and gradients. And that it compiles."""
+"""The mechanism's GPU kernel, interpreted and on a GPU, against the plain form. And that it compiles."""
 
 from collections.abc import Callable
 
@@ -51,8 +51,9 @@ CASES = [
 ]
 
 
+@pytest.mark.parametrize("interpret", [True, pytest.param(False, marks=pytest.mark.gpu)])
 @pytest.mark.parametrize(("case", "noise", "substeps"), CASES)
-def test_as_the_plain_form(case: dict, noise: dropout.Dropout, substeps: int) -> None:
+def test_as_the_plain_form(case: dict, noise: dropout.Dropout, substeps: int, interpret: bool) -> None:
     plain, fused, *arguments = pieces(case, noise, substeps)
     weight = jax.random.normal(jax.random.key(3), (K, case["states"]))
 
@@ -62,8 +63,9 @@ def test_as_the_plain_form(case: dict, noise: dropout.Dropout, substeps: int) ->
         value = lambda *given: jnp.sum(weight * change(*given))  # noqa: E731
         return jax.jit(change)(*arguments), jax.jit(jax.grad(value, by, allow_int=True))(*arguments)
 
-    expected, gradients = both(plain)
-    got, ours = both(fused[True])
+    with jax.default_matmul_precision("float32"):  # as in a run: a GPU's products are less exact by default
+        expected, gradients = both(plain)
+    got, ours = both(fused[interpret])
     np.testing.assert_allclose(got, expected, rtol=2e-5, atol=2e-5)
     for mine, theirs in zip(jax.tree.leaves(ours), jax.tree.leaves(gradients), strict=True):
         if mine.dtype == jnp.float32:
