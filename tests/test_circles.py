@@ -104,7 +104,10 @@ def test_none_is_found_where_there_is_none(plant: Any) -> None:
         ("MountainCarContinuous-v0", ()),
     ],
 )
-def test_on_plants_of_gymnasium(env: str, pairs: circles.Circles) -> None:
+def test_on_plants_of_gymnasium(
+    env: str, pairs: circles.Circles, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warnings to a file there
     config = Config(task="gym", env=env, cost=f"{__name__}:upright", horizon=5)
     known = tasks.resolve(config)
     assert known.circles == pairs
@@ -162,6 +165,7 @@ def learned(folder: Path, env: str, cost: str, **given: Any) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_plant_seen_by_cosine_and_sine_is_learned_as_if_seen_by_its_angle(tmp_path: Path) -> None:
     """The same data to the last bit, and costs, searches and controls but for rounding. The folder keeps both."""
     first = learned(tmp_path / "circle", "Pendulum-v1", "upright")

@@ -85,7 +85,7 @@ def test_a_model_takes_it_where_there_is_one_gpu(monkeypatch: pytest.MonkeyPatch
     interpreted = kernel.fused
     monkeypatch.setattr(kernel, "fused", fused)
     for there in (False, True):
-        monkeypatch.setattr("pegasus_jax.models.lagrangian.alone_on_gpu", lambda x, there=there: there)
+        monkeypatch.setattr("pegasus_jax.models.lagrangian.pallas_allowed", lambda x, there=there: there)
         got = model.particles(model.apply)(posterior, masks, x, u)
         np.testing.assert_allclose(got.mean, expected.mean, rtol=2e-5, atol=2e-5)
         np.testing.assert_allclose(got.std, expected.std, rtol=1e-6)

@@ -226,7 +226,8 @@ def test_another_physics_is_seen_by_comparing(parts: dict[str, str], tmp_path: P
         mjcf_check.compare(made)
 
 
-def test_a_simulation_that_breaks_down_is_not_learned_from(tmp_path: Path) -> None:
+def test_a_simulation_that_breaks_down_is_not_learned_from(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     motor = '<position joint="elbow" kp="1e7" ctrllimited="true" ctrlrange="-1 1"/>'
     with pytest.raises(ValueError, match=r"not stable: it breaks down in period \d+ of"):
         mjcf_check.compare(arm(tmp_path / "arm.xml", motor=motor, density='0" timestep="0.02'))

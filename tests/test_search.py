@@ -300,7 +300,7 @@ def test_one_program_serves_the_first_search_and_all_others():
 
 def test_a_new_search_forgets_the_moments_or_goes_on_with_them():
     for reset in (True, False):
-        found, learner = on_table(search_table(3), optax.adam(0.1), value=rowless, reset=reset)
+        found, learner = on_table(search_table(3), optax.adam(0.1), value=rowless, reset_optimizer=reset)
         once, _ = found.run(jax.random.key(7), learner, 1.0, steps=3)
         twice, _ = found.run(jax.random.key(7), once, 1.0, steps=3)
         assert twice.optimizer.optimizer[0].count == (3 if reset else 6)

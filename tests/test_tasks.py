@@ -63,14 +63,14 @@ def test_tasks_bring_their_defaults() -> None:
     two, six = parse("task=swimmer_belly_up"), parse("task=swimmer_belly_up", "legs=6", "trials=8")
     for config in (two, six):
         assert (config.model.hidden, config.policy.hidden, config.policy.dropout) == ((200,) * 4, (200,) * 4, 0.1)
-        assert (config.explore.trials, config.explore.kind, config.search.steps) == (5, "walk", 500)
+        assert (config.explore.trials, config.explore.kind, config.search.steps) == (2, "walk", 500)
         assert (config.model.dropout, config.model.ensemble_size, config.model.kl_weight) == ("log_normal", 5, 1)
-    assert (two.search.particles, two.fit.steps, two.trials) == (400, 2000, 50)
-    assert (six.search.particles, six.fit.steps, six.trials) == (500, 4000, 8)
+    assert (two.search.particles, two.fit.steps, two.trials) == (200, 2000, 50)
+    assert (six.search.particles, six.fit.steps, six.trials) == (200, 4000, 8)
     for word in ("model=log_normal", "algorithm=paper"):  # one network, as the paper has it
         assert parse("task=swimmer_belly_up", word).model.ensemble_size == 1
     rates = {legs: parse("task=swimmer_depth_change", f"legs={legs}").search.learning_rate for legs in (2, 6)}
-    assert rates == {2: 1e-3, 6: 1e-4}
+    assert rates == {2: 1e-3, 6: 1e-3}
     assert parse("task=swimmer_belly_up", "policy=mlp").policy.dropout == 0
     assert parse("task=swimmer_belly_up", "algorithm=deep_pilco").search.particles == 10
 

@@ -35,7 +35,9 @@ ONE_CORE = {
     **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
     "JAX_PLATFORMS": "cpu",
     "XLA_FLAGS": "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1",
-    "PYTHONPATH": os.pathsep.join(str(ROOT / name) for name in ("src", "envs", "")),
+    "PYTHONPATH": os.pathsep.join(
+        [*(str(ROOT / name) for name in ("src", "envs", "")), os.environ.get("PYTHONPATH", "")]
+    ),
 }
 SHARES = (0.25, 0.5, 0.75, 1.0)  # of the time by which a plant is to be learned, at which the table looks
 

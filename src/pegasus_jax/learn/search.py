@@ -66,13 +66,13 @@ def search(
     if fresh is None and FRESH in table.candidate:
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
     rows = of_search(table, earlier)
+    following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
     row, end = (jnp.asarray(begin)[i] for i in (first, first + steps))
     count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
 
     def visit(k: Array, loop: tuple) -> tuple:
         learner, scenarios, info = loop
         now: SearchTable = jax.tree.map(lambda column: column[row + k], rows)
-        scenarios = sampler.redraw(key, now.scenarios, scenarios, posterior)
         (own, state), choose = learner, partial(jax.lax.select_n, now.candidate)
         visited = jax.tree.map(choose, own, own if fresh is None else fresh, state.start, state.start)
         value, gradient = jax.value_and_grad(problem.objective)(visited, posterior, scenarios, now)
@@ -80,6 +80,7 @@ def search(
         i = now.iteration - first
         stepped = jnp.where(now.action == STEP, i, steps)
         norms = info.gradient_norm.at[stepped].set(optax.tree.norm(gradient), mode="drop")
+        scenarios = sampler.redraw(key, following[row + k], scenarios, posterior)
         return learner, scenarios, SearchInfo(info.objective.at[i].set(cost), norms, info.skipped + skipped)
 
     scenarios, none = sampler.draw(key, jnp.asarray(first, jnp.int32), posterior), jnp.full(steps, jnp.nan)
