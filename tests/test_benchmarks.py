@@ -15,11 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import compare, readme_table, results_page, scaling, searches, timing
+from benchmarks import compare, readme_table, results_page, scaling, timing
 from benchmarks.study import RESULTS
 from benchmarks.workloads import SIZES, flop, products, workload
 from pegasus_jax.runs import config_io, machine
-from probes import unchecked
 
 TINY = {
     "task": "cartpole",
@@ -177,27 +176,6 @@ def test_a_peer_that_does_other_work_is_refused(found):
     assert agreed("peer", {"gradient": 1e-4}) == {"peer_gradient_difference": 1e-4}
     with pytest.raises(RuntimeError, match=f"peer: the {list(found)[-1]} differs"):
         agreed("peer", found)
-
-
-@pytest.mark.slow
-def test_searches_from_fresh_policies_are_judged_side_by_side(tmp_path, capsys, monkeypatch):
-    seen, real = [], searches.searched
-
-    def watched(config, states, fresh):
-        """The first as it is; one that found its way, for the rest."""
-        seen.append((config.search.cost_width_start, config.search.init, states.trial.tolist()))
-        return real(config, states, fresh) if len(seen) == 1 else np.full((4, fresh), [0.3, 0.5, 0.9])
-
-    monkeypatch.setattr(searches, "searched", watched)
-    small = TINY | {"fit.steps": "5", "search.steps": "2", "search.refine_fraction": "0"}
-    options = ["seeds=0-1", "after=1,2", "fresh=3", "each=search.cost_width_start=4", f"out={tmp_path}"]
-    unchecked(searches.main)([*options, *(f"{name}={value}" for name, value in small.items())])
-    assert seen == [(2.0, "previous", [1, 1, 2, 2]), (4.0, "previous", [1, 1, 2, 2])]
-    costs = json.loads((tmp_path / "searches.json").read_text())["imagined"]
-    assert np.shape(costs["as it is"]) == (4, 3)
-    assert 0.9 < np.min(costs["as it is"]) <= 1, "two iterations swing nothing up"
-    assert costs["search.cost_width_start=4"] == [[0.3, 0.5, 0.9]] * 4
-    assert "mean 0.567  median 0.500  below .35 33%, .6 67%  above .8 33%" in capsys.readouterr().out
 
 
 # Stored results
