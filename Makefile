@@ -7,7 +7,7 @@ FIGURE ?=
 
 BIN   := $(VENV)/bin
 STAMP := $(VENV)/.installed
-CODE  := $(wildcard src envs tests benchmarks)
+CODE  := $(wildcard src envs tests benchmarks examples)
 
 # A file's tests share what they compile, so a file stays on one core.
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations 10

@@ -291,7 +291,7 @@ def run(exp: Experiment, trials: int, episodes: int = 20) -> Callable[[Key], tup
     """key -> (state, TrialInfo [T, ...]): a whole run as one function; jit(vmap(run(...)))(keys) is a study."""
 
     if exp.drive is not None:
-        raise ValueError(f"task {exp.task.name} has an environment, which no program can hold; use pegasus_jax.train")
+        raise ValueError(f"task {exp.task.name} has an environment, which no program can hold; use pegasus-train")
     room = jax.eval_shape(exp.init, jax.random.key(0)).data.x.shape[0] // exp.task.horizon
     if trials > room:
         raise ValueError(
