@@ -74,9 +74,8 @@ def search_of(
     found = searcher(Problem(value, draws, optimizer, table, search.reset_optimizer))
     if search.num_starts > 1:
         lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
-        window = (
-            1 if search.refine_fraction else max(1, search.steps // 20)
-        )  # what refines may end with another than its last
+        # What refines may end with another than its last.
+        window = 1 if search.refine_fraction else max(1, search.steps // 20)
         fresh = lambda key, given: inherited(policy.init(key), given)  # noqa: E731
         found = best_of(found, fresh, num_starts=search.num_starts, window=window, lasting=lasting)
     # A refined policy is good for particles, not for their Gaussian.

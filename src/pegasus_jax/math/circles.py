@@ -21,9 +21,7 @@ def to_state(x: Any, circles: Circles) -> Any:
     """States [..., D] of observations [..., O], arrays of NumPy or JAX; the angles are in [-pi, pi] rad."""
     if not circles:
         return x
-    xp = x.__array_namespace__()
-    pair_at = {min(pair): pair for pair in circles}
-    columns = []
+    xp, pair_at, columns = x.__array_namespace__(), _pair_at(circles), []
     for i in entries(x.shape[-1], circles):
         cosine, sine = pair_at.get(i, (i, i))
         columns.append(xp.atan2(x[..., sine], x[..., cosine]) if i in pair_at else x[..., i])
@@ -34,9 +32,8 @@ def to_observation(x: Any, circles: Circles) -> Any:
     """Observations [..., O] of states [..., D]: every pair lies on the unit circle, whatever was read."""
     if not circles:
         return x
-    xp = x.__array_namespace__()
+    xp, pair_at = x.__array_namespace__(), _pair_at(circles)
     columns: dict[int, Any] = {}
-    pair_at = {min(pair): pair for pair in circles}
     for place, i in enumerate(entries(x.shape[-1] + len(circles), circles)):
         if i in pair_at:
             cosine, sine = pair_at[i]
@@ -54,7 +51,7 @@ def places(of: Sequence[int], size: int, circles: Circles) -> tuple[int, ...]:
 
 def names(size: int, circles: Circles) -> tuple[str, ...]:
     """Names of the state's entries: those of the observation are x0, x1, ..."""
-    pair_at = {min(pair): pair for pair in circles}
+    pair_at = _pair_at(circles)
     return tuple(
         f"atan2(x{pair_at[i][1]}, x{pair_at[i][0]})" if i in pair_at else f"x{i}" for i in entries(size, circles)
     )
@@ -62,7 +59,7 @@ def names(size: int, circles: Circles) -> tuple[str, ...]:
 
 def angle_places(size: int, circles: Circles) -> tuple[int, ...]:
     """The entries of the state that are angles of circles."""
-    return places([min(pair) for pair in circles], size, circles)
+    return places([*_pair_at(circles)], size, circles)
 
 
 def find(seen: np.ndarray, others: Sequence[int] = ()) -> Circles:
@@ -96,3 +93,8 @@ def entries(size: int, circles: Circles) -> list[int]:
     """The entries of an observation of `size` that have a place in the state, in its order: of a pair, the earlier."""
     gone = {max(pair) for pair in circles}
     return [i for i in range(size) if i not in gone]
+
+
+def _pair_at(circles: Circles) -> dict[int, tuple[int, ...]]:
+    """The pair whose angle takes the place of an entry of the observation."""
+    return {min(pair): pair for pair in circles}

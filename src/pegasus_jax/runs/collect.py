@@ -33,9 +33,8 @@ def collected(job: Job, states: RunState, trial: int) -> list[Episode]:
     episodes = []
     for index, ran in enumerate(ran for ran in known if ran is not None):
         now = costed(job, ran, trial)
-        if (
-            now is not ran and task.environment is None and is_main_process()
-        ):  # a damaged file, or a cost that its user mended
+        # A damaged file, or a cost that its user mended.
+        if now is not ran and task.environment is None and is_main_process():
             where = job.writer.where(index, trial)
             job.display.line(f"{where} has costs that are not finite; counted again from its observations")
         episodes.append(now)
@@ -82,9 +81,8 @@ def costed(job: Job, ran: Episode, trial: int) -> Episode:
     x = np.asarray(ran.trajectory.x)
     cost = np.asarray(jax.vmap(job.experiment.task.cost)(jnp.asarray(x[1:])))
     for (t,) in np.argwhere(~np.isfinite(cost))[:1]:
-        found = (
-            f"the cost of the observation {to_observation(x[t + 1], job.experiment.task.circles).tolist()} is {cost[t]}"
-        )
+        seen = to_observation(x[t + 1], job.experiment.task.circles).tolist()
+        found = f"the cost of the observation {seen} is {cost[t]}"
         job.writer.problem(f"trial {trial}: {found}; mend the cost")
     return ran._replace(trajectory=ran.trajectory._replace(cost=cost))
 

@@ -15,12 +15,11 @@ class Removed(NamedTuple):
 
 
 class Renamed(NamedTuple):
-    """A setting that has another name."""
+    """A setting that has another name. Of two with the same new name, the later row of the table decides."""
 
     key: str
-    values: Mapping[Any, Any] = MappingProxyType(
-        {}
-    )  # old value -> new value, of those that changed; None: it says nothing
+    # old value -> new value, of those that changed; None: it says nothing
+    values: Mapping[Any, Any] = MappingProxyType({})
 
 
 REMOVED = {
@@ -88,18 +87,17 @@ def today(stored: dict[str, Any]) -> dict[str, Any]:
 
     Raises ConfigError where a removed setting had another value than the one that is left.
     """
-    found: dict[str, Any] = {}
-    for key, value in sorted(stored.items(), key=lambda item: item[0] == "search.anew"):  # after search.restart
+    for key, value in stored.items():
         if key in REMOVED and value != REMOVED[key].always:
             raise ConfigError(
                 f"{key}={shown(value)} was removed, only {shown(REMOVED[key].always)} is left;"
                 f" an earlier version of pegasus_jax reads this run"
             )
-        if key in RENAMED:
-            now, values = RENAMED[key]
+    found = {key: value for key, value in stored.items() if key not in REMOVED and key not in RENAMED}
+    for key, (now, values) in RENAMED.items():
+        if key in stored:
+            value = stored[key]
             changed = values.get(value, value) if isinstance(value, str | bool) else value
             if changed is not None or not values:
                 found[now] = changed
-        elif key not in REMOVED:
-            found[key] = value
     return found
