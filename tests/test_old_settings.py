@@ -1,13 +1,15 @@
-"""Settings of earlier versions: a run stored with them is read, and a command that has one is told the new one."""
+"""Settings of earlier versions: a stored run is read with them, and a command takes them and says the new names."""
 
 import re
 
 import pytest
 
 from pegasus_jax.checks import ConfigError, shown
+from pegasus_jax.cli import main
+from pegasus_jax.cli import train as cli_train
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
-from pegasus_jax.runs.removed import REMOVED, RENAMED
+from pegasus_jax.runs.removed import REMOVED, RENAMED, renamed
 from test_settings import parse
 
 
@@ -108,3 +110,26 @@ def test_an_old_word_is_answered_with_the_new_one(word, line):
     with pytest.raises(ConfigError) as refused:
         parse(word)
     assert str(refused.value) == line
+
+
+@pytest.mark.parametrize("key", RENAMED)
+def test_a_command_takes_an_old_word_for_todays(key):
+    value, text = OLD[key]
+    *others, own = text.split()
+    words, answers = renamed([*others, f"{key}={shown(value)}"])
+    assert parse(*words) == parse(*others, own)
+    (answer,) = answers
+    assert answer.startswith(f"{key} is now called {RENAMED[key].key}")
+
+
+def test_an_old_word_that_says_nothing_today_is_left_out():
+    assert renamed(["search.restart=false", "search.anew=false", "seed=1"])[0] == ["search.init=previous", "seed=1"]
+
+
+def test_a_command_says_the_new_name_and_goes_on(capsys):
+    words = ["evaluation=0", "precision=double", "trials=0"]
+    assert main._code(cli_train.train, words, "") == 2
+    note, other, refused = capsys.readouterr().err.splitlines()
+    assert note == "note: evaluation is now called eval_episodes"
+    assert other == "note: precision is now called x64, where single is false, double is true"
+    assert refused.startswith("pegasus: trials=0 ")

@@ -11,6 +11,7 @@ from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli import help, runs
 from pegasus_jax.cli import train as cli_train
 from pegasus_jax.runs import cache, files
+from pegasus_jax.runs.removed import renamed
 
 
 def train() -> None:
@@ -84,7 +85,8 @@ def _let_robots_go() -> None:
 def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: str) -> int:
     """The exit status of a command that nobody stopped."""
     try:
-        words = [*words, *(_always() if words and command in (cli_train.train, runs.figures) else ())]
+        always = _always() if words and command in (cli_train.train, runs.figures) else ()
+        words = _of_today([*words, *always])
         if not words or help.WORDS & {*words}:
             print(help.help_of(text, words), end="")
             return 0 if words else 2
@@ -99,6 +101,14 @@ def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: 
         print(f"pegasus: {files.refused(error)}{_goes_on()}", file=sys.stderr)
         return 2
     return 0
+
+
+def _of_today(words: Sequence[str]) -> list[str]:
+    """The words with today's names of settings: a script that has an old one works, and is told the new one."""
+    today, answers = renamed(words)
+    for answer in answers:
+        print(f"note: {answer}", file=sys.stderr)
+    return today
 
 
 def _goes_on() -> str:

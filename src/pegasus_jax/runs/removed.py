@@ -1,6 +1,6 @@
 """Settings of earlier versions: what a config stored by one of them means today, and what serves instead."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
@@ -73,13 +73,33 @@ RENAMED = {
 
 
 def refuse(key: str) -> None:
-    """Raises ConfigError for a word of the command line that names a setting of an earlier version."""
+    """Raises ConfigError for the name of a setting of an earlier version."""
     if key in REMOVED:
         raise ConfigError(f"{key} was removed; instead: {REMOVED[key].instead}")
     if key in RENAMED:
-        now, values = RENAMED[key]
-        known = ", ".join(f"{shown(old)} is {shown(new)}" for old, new in values.items() if new is not None)
-        raise ConfigError(f"{key} is now called {now}{known and f', where {known}'}")
+        raise ConfigError(answer(key))
+
+
+def answer(key: str) -> str:
+    """What a setting of another name is called now: one line."""
+    now, values = RENAMED[key]
+    known = ", ".join(f"{shown(old)} is {shown(new)}" for old, new in values.items() if new is not None)
+    return f"{key} is now called {now}{known and f', where {known}'}"
+
+
+def renamed(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """(the words of a command with today's names and values of its settings, a line for each that had an old one)."""
+    today, answers = [], []
+    for word in words:
+        key, equals, text = word.partition("=")
+        if equals and key in RENAMED:
+            now, values = RENAMED[key]
+            value = {shown(old): new for old, new in values.items()}.get(text, text)
+            today += [] if value is None else [f"{now}={value if isinstance(value, str) else shown(value)}"]
+            answers.append(answer(key))
+        else:
+            today.append(word)
+    return today, answers
 
 
 def today(stored: dict[str, Any]) -> dict[str, Any]:
