@@ -3,6 +3,7 @@
 import shutil
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import jax
@@ -92,3 +93,7 @@ def test_what_is_no_run_says_so(tmp_path: Path) -> None:
     shutil.rmtree(run / "checkpoints")
     with pytest.raises(RunError, match="holds no checkpoint"):
         pegasus_jax.controller(run, trial="last")
+
+
+def test_the_controller_is_where_scripts_on_robots_look_for_it():
+    assert import_module("pegasus_jax.deploy").controller is pegasus_jax.controller

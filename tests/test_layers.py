@@ -23,7 +23,7 @@ LAYERS = {
     6: "runs.",
     7: "viz.",
     8: "studies.",
-    9: "cli. __init__",
+    9: "cli. deploy __init__",
 }
 APPLICATION = 6  # the first layer that knows of files, terminals and people
 
