@@ -30,13 +30,40 @@ def test_unwhiten_undoes_whiten(seed, size, full):
     np.testing.assert_allclose(w.root @ w.inverse, np.eye(F), atol=1e-3)
 
 
+def covariance(rows):
+    """Of the rows and one more, whose columns are uncorrelated: the correlations shrink by N / (N + 1)."""
+    found = np.cov(rows.astype(np.float64).T, bias=True)
+    return (len(rows) * found + np.diag(np.diag(found))) / (len(rows) + 1)
+
+
 @given(seeds, st.integers(10, N))
 def test_white_rows_have_zero_mean_and_identity_covariance(seed, size):
+    """The covariance with one more row of uncorrelated columns, which shrinks towards that of the rows."""
     rows = correlated(seed)
     w = whitener(jnp.asarray(rows), jnp.int32(size))
     white = np.asarray(whiten(w, jnp.asarray(rows)), np.float64)[:size]
     np.testing.assert_allclose(white.mean(0), 0, atol=1e-3)
-    np.testing.assert_allclose(np.cov(white.T, bias=True), np.eye(F), atol=3e-3)
+    inverse = np.asarray(w.inverse, np.float64)
+    np.testing.assert_allclose(inverse @ covariance(rows[:size]) @ inverse.T, np.eye(F), atol=3e-3)
+
+
+def test_a_thousand_rows_are_whitened_as_if_there_were_no_other():
+    rows = correlated(5, rows=1000)
+    w = whitener(jnp.asarray(rows), jnp.int32(1000))
+    white = np.asarray(whiten(w, jnp.asarray(rows)), np.float64)
+    np.testing.assert_allclose(np.cov(white.T, bias=True), np.eye(F), atol=2e-2)
+
+
+@given(seeds)
+def test_seven_rows_of_nearly_dependent_columns_are_not_enlarged(seed):
+    """The rows of a first fall: a step of a tenth off their plane stays of the order of one."""
+    noise = np.random.default_rng(seed)
+    rows = np.zeros((N, F), np.float32)
+    rows[:7] = noise.normal(size=(7, F))
+    rows[:7, 2] = rows[:7, 0] + 0.02 * noise.normal(size=7)
+    w = whitener(jnp.asarray(rows), jnp.int32(7))
+    step = 0.1 * rows[:7].std(0) * np.array([0, 0, 1], np.float32)
+    assert np.abs(np.asarray(whiten(w, jnp.asarray(rows[:7] + step))) - np.asarray(whiten(w, rows[:7]))).max() < 0.5
 
 
 @given(seeds)
@@ -95,7 +122,7 @@ def test_the_factor_is_lower_triangular_and_in_units_of_the_data(scale):
     rows = correlated(3) * np.float32(scale)
     w = whitener(jnp.asarray(rows), jnp.int32(N))
     assert np.array_equal(np.asarray(w.root), np.tril(w.root))
-    expected = np.linalg.cholesky(np.cov(rows.astype(np.float64).T, bias=True))
+    expected = np.linalg.cholesky(covariance(rows))
     np.testing.assert_allclose(w.root, expected, rtol=2e-3, atol=2e-3 * scale)
 
 

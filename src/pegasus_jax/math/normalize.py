@@ -19,9 +19,11 @@ class Whitener(NamedTuple):
 def whitener(rows: Array, size: Array, *, full: bool = True, jitter: float = 1e-6) -> Whitener:
     """The whitener of the first `size` rows of rows [N, F] (docs/reference.md 4.6).
 
-    With `full`, the root is the Cholesky factor of the rows' covariance; otherwise it is diagonal. `jitter` is relative
-    to each column's variance and keeps columns that hardly vary (an angle before it has moved) invertible. A column
-    that those before it determine is scaled alone, see `independent`.
+    With `full`, the root is the Cholesky factor of the rows' covariance; otherwise it is diagonal. The covariance is
+    that of the rows and of one more row whose columns are uncorrelated: a few rows, such as an episode that ends after
+    seven steps, cannot tell a correlation of 1 from one of nearly 1, and whitening enlarges the difference. `jitter` is
+    relative to each column's variance and keeps columns that hardly vary (an angle before it has moved) invertible. A
+    column that those before it determine is scaled alone, see `independent`.
     """
     used = (jnp.arange(rows.shape[0]) < size)[:, None]
     count = jnp.maximum(size, 1).astype(rows.dtype)
@@ -33,8 +35,9 @@ def whitener(rows: Array, size: Array, *, full: bool = True, jitter: float = 1e-
         return Whitener(mean, jnp.diag(scale), jnp.diag(1 / scale))
     # The factor is taken of the correlation matrix, whose entries are all of order one.
     identity = jnp.eye(rows.shape[1], dtype=rows.dtype)
-    correlation = (centered / scale).T @ (centered / scale) / count
-    free = independent(correlation)
+    products = (centered / scale).T @ (centered / scale)
+    free = independent(products / count)
+    correlation = (products + identity) / (count + 1)
     correlation = jnp.where(free[:, None] & free, correlation, identity)
     root = jnp.linalg.cholesky(correlation + jitter * identity)
     inverse = jnp.linalg.inv(root)
