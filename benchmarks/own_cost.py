@@ -10,13 +10,15 @@ from typing import Any
 
 from benchmarks import study
 from pegasus_jax import tasks
+from pegasus_jax.types import Cost
 
 POSED = tasks.of_plant
 
 
 def of_plant(name: str, plant: Any) -> Any:
     """The task that a plant poses to someone who knows its cost only as a function."""
-    return POSED(name, plant)._replace(expected_cost=None, cost_with_width=None)
+    task = POSED(name, plant)
+    return task._replace(cost=Cost(task.cost.of_state))
 
 
 if __name__ == "__main__":

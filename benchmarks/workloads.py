@@ -22,7 +22,7 @@ from pegasus_jax.imagine.objective import objective
 from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.math.angles import encode
 from pegasus_jax.runs import config_io
-from pegasus_jax.types import Array, Experiment, Params, Period, RunState, Scenarios, Task, Trajectory
+from pegasus_jax.types import Array, Cost, Experiment, Params, Period, RunState, Scenarios, Task, Trajectory
 
 # Every iteration alike, as the paper's and the peers' are: what a search refines by is another program.
 ALIKE = {"search.standardized_noise": "false", "search.refine_fraction": "0", "search.init": "better"}
@@ -98,10 +98,10 @@ def goal(task: Task) -> Array:
     return encode(jnp.asarray(task.start_mean, float), task.angles) + 1.0
 
 
-def near(task: Task) -> Callable[[Array], Array]:
+def near(task: Task) -> Cost:
     """1 - exp(-|features - goal|^2 / (2 F))."""
     target = goal(task)
-    return costs.saturating(lambda x: encode(x, task.angles) - target, len(target) ** 0.5)
+    return costs.saturating(lambda x: encode(x, task.angles) - target, len(target) ** 0.5, task.angles)
 
 
 def wandering(task: Task, seed: int) -> Trajectory:

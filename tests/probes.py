@@ -53,7 +53,7 @@ def cart(horizon: int = 8) -> Task:
             step,
             lambda x: x,
         ),
-        cost=cost.saturating(lambda x: x, 1.0),
+        cost=cost.saturating(lambda x: x, 1.0, ()),
         angles=(),
         start_mean=np.array([1.0, 0.0]),
         start_std=start_std,
@@ -64,8 +64,6 @@ def cart(horizon: int = 8) -> Task:
         dt=dt,
         state_names=("x", "v"),
         control_names=("u",),
-        expected_cost=cost.expected_saturating(lambda x: x, 1.0, ()),
-        cost_with_width=partial(cost.widened, lambda x: x, 1.0, ()),
         rates=(1,),
     )
 
@@ -90,7 +88,7 @@ def dial(horizon: int = 6) -> Task:
             lambda angle, u: angle + 0.8 * u,
             seen,
         ),
-        cost=cost.saturating(error, 0.5),
+        cost=cost.saturating(error, 0.5, (0,)),
         angles=(0,),
         start_mean=np.array([2.5]),
         start_std=np.array([0.2]),
@@ -101,8 +99,6 @@ def dial(horizon: int = 6) -> Task:
         dt=1.0,
         state_names=("angle",),
         control_names=("turn",),
-        expected_cost=cost.expected_saturating(error, 0.5, (0,)),
-        cost_with_width=partial(cost.widened, error, 0.5, (0,)),
     )
 
 
@@ -326,7 +322,7 @@ def make_rig(particles: int, horizon: int, heteroscedastic: bool = True) -> Rig:
     posterior, params = start(experience())
     wide = lambda leaf: leaf.astype(float) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf  # noqa: E731
     posterior, params = jax.tree.map(wide, (posterior, params))  # flax makes float32 kernels even where float64 is on
-    distance = cost.of_particles(cost.saturating(lambda x: jnp.array([x[0], x[1], jnp.sin(x[2])]), 1.0))
+    distance = cost.of_particles(cost.saturating(lambda x: jnp.array([x[0], x[1], jnp.sin(x[2])]), 1.0, (2,)))
     return Rig(dynamics, policy, blocks, posterior, params, distance, particles, horizon)
 
 

@@ -57,17 +57,10 @@ def error(x: jax.Array) -> jax.Array:
     return x
 
 
-COST = pg.Cost(
-    pg.costs.saturating(error, 1.0),
-    expected=pg.costs.expected_saturating(error, 1.0, ()),
-    with_width=partial(pg.costs.widened, error, 1.0, ()),
-)
 TASK = pg.Task(
     name="cart",
     plant=Plant(),
-    cost=COST.of_state,
-    expected_cost=COST.expected,
-    cost_with_width=COST.with_width,
+    cost=pg.costs.saturating(error, 1.0, ()),
     angles=(),
     start_mean=np.zeros(D),
     start_std=np.ones(D),
@@ -151,7 +144,7 @@ def _() -> Any:
     state = experiment.add_episode(state, experiment.collect(state))
     searched, info = experiment.search(state)
     assert info == "searched"
-    assert experiment.task.cost(X) == pytest.approx(2 * float(X @ X))
+    assert experiment.task.cost.of_state(X) == pytest.approx(2 * float(X @ X))
     assert experiment.imagine(searched)[1].shape == (H, K)
     return experiment.fit(state)[1]
 
@@ -271,20 +264,20 @@ def _() -> Any:
 
 @example(*(f"costs.{name}" for name in pg.costs.__all__))
 def _() -> Any:
-    of_state, expected = pg.costs.widened(error, 1.0, (), 2.0)
+    cost = pg.costs.saturating(error, 1.0, ())
+    assert cost.widen is not None
     x = jax.random.normal(key(), (H, K, D))
-    each = pg.costs.of_particles(of_state)(x)
+    each = pg.costs.of_particles(cost.widen(2.0))(x)
     stopped = pg.costs.until_stop(each, x, lambda x: x[0] > 1, 1.0)
     assert each.shape == stopped.shape == (H, K)
-    assert pg.costs.of_matched(expected)(x).shape == (H, 1)
-    by_nodes = pg.costs.expected_by_nodes(pg.costs.saturating(error, 1.0), D)
-    closed = pg.costs.expected_saturating(error, 1.0, ())
+    assert pg.costs.of_matched(cost)(x).shape == (H, 1)
+    by_nodes, closed = pg.costs.expected_by_nodes(cost.of_state), pg.costs.expectation(cost)
     return by_nodes(X, jnp.eye(D)), closed(X, jnp.eye(D)), pg.costs.mean(stopped), pg.costs.total(each)
 
 
 def test_the_two_expectations_of_a_cost_agree() -> None:
-    by_nodes = pg.costs.expected_by_nodes(pg.costs.saturating(error, 1.0), D)
-    closed = pg.costs.expected_saturating(error, 1.0, ())
+    closed = pg.costs.expectation(TASK.cost)
+    by_nodes = pg.costs.expectation(pg.Cost(TASK.cost.of_state))
     mean, cov = X, jnp.array([[0.1, 0.05], [0.05, 0.2]])
     np.testing.assert_allclose(by_nodes(mean, cov), closed(mean, cov), atol=1e-3)
 
@@ -332,7 +325,7 @@ def _() -> Any:
     assert made.state_names == configured.state_names
     with pytest.raises(pg.ConfigError, match="did you mean 'cartpole'"):
         pg.tasks.make("cartpol")
-    return made.cost(jnp.zeros(4))
+    return made.cost.of_state(jnp.zeros(4))
 
 
 def public(module: ModuleType = pg, prefix: str = "") -> dict[str, Any]:
@@ -450,8 +443,12 @@ PIECES_THAT_ARE_WRONG = [
         DYNAMICS._replace(apply=lambda *_: pg.Prediction(jnp.zeros(3), jnp.ones(D)), particles=None),
         r"mean of what dynamics\.apply returns for K particles has shape \(5, 3\); expected \[K, D\] \(5, 2\)",
     ),
-    ("cost", pg.costs.of_particles(lambda x: x), r"the cost of one state has shape \(2,\); expected \(\)"),
-    ("cost", pg.costs.of_particles(lambda x: x[0] > 1), r"the cost of one state is of bool; expected floating-point"),
+    ("cost", pg.costs.of_particles(pg.Cost(lambda x: x)), r"the cost of one state has shape \(2,\); expected \(\)"),
+    (
+        "cost",
+        pg.costs.of_particles(pg.Cost(lambda x: x[0] > 1)),
+        r"the cost of one state is of bool; expected floating-point",
+    ),
 ]
 
 
@@ -484,9 +481,9 @@ def test_a_policy_that_answers_wrongly_is_named_before_the_plant_moves() -> None
         jax.eval_shape(experiment.collect, state)
 
 
-def test_a_function_is_no_cost() -> None:
-    with pytest.raises(pg.ConfigError, match=r"is no Cost; .*Cost\(function\)"):
-        pg.compose(CONFIG, TASK, cost=lambda x: x)  # type: ignore[arg-type]
+def test_a_number_is_no_cost() -> None:
+    with pytest.raises(pg.ConfigError, match=r"cost=0\.5 is no Cost; .*function of one state"):
+        pg.compose(CONFIG, TASK, cost=0.5)  # type: ignore[arg-type]
 
 
 # What is imported when

@@ -21,7 +21,7 @@ from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching, scenarios
 from pegasus_jax.imagine.objective import objective
 from pegasus_jax.learn.fit import falling
-from pegasus_jax.types import Dataset, Learner
+from pegasus_jax.types import Cost, Dataset, Learner
 from probes import PENDULUM, cart, known, linear_policy, tiny
 
 
@@ -53,9 +53,7 @@ def test_settings_of_the_search_reach_the_objective():
 def test_a_search_starts_with_the_wider_cost_and_ends_with_the_tasks(of):
     """A cost twice as wide is the task's cost of half the error; from half of the search on it is the task's own."""
     wide = float(searcher(cost_estimator=of, cost_width_start=2.0)[2](searcher(cost_estimator=of)[1])[1].objective[0])
-    halved = cart(horizon=2)._replace(
-        cost=cost.saturating(lambda x: x / 2, 1.0), expected_cost=cost.expected_saturating(lambda x: x / 2, 1.0, ())
-    )
+    halved = cart(horizon=2)._replace(cost=cost.saturating(lambda x: x / 2, 1.0, ()))
     chosen = dataclasses.replace(
         tiny(), search=config.Search(steps=1, particles=5, cost_estimator=of, cost_width_start=1.0)
     )
@@ -218,7 +216,8 @@ def test_an_annealing_search_has_one_course():
 
 
 def test_a_cost_without_a_width_cannot_be_widened():
-    task = cart(horizon=2)._replace(cost_with_width=None)
+    task = cart(horizon=2)
+    task = task._replace(cost=task.cost._replace(widen=None))
     with pytest.raises(ConfigError, match=r"search\.cost_width_start=4 needs a cost with a width.*the nearest is 1"):
         compose(tiny(), task)
 
@@ -227,11 +226,11 @@ def test_the_matched_cost_of_any_function_is_that_of_its_nodes():
     """Near the closed form of the same cost, which was not asked for; and of no width."""
     task, search = cart(horizon=3), config.Search(cost_estimator="gaussian", cost_width_start=1)
     x = 0.4 * jax.random.normal(jax.random.key(0), (3, 20, len(task.state_names)))
-    own = costs_of(search, task._replace(expected_cost=None))(None, None)(x)
+    own = costs_of(search, task._replace(cost=Cost(task.cost.of_state)))(None, None)(x)
     known = costs_of(search, task)(None, None)(x)
     assert own.shape == (3, 1)
-    by_nodes = cost.expected_by_nodes(task.cost, len(task.state_names))
-    np.testing.assert_allclose(own, cost.of_matched(by_nodes)(x), rtol=1e-6)
+    by_nodes = cost.expected_by_nodes(task.cost.of_state)
+    np.testing.assert_allclose(own, cost.of_matched(task.cost._replace(expected=by_nodes))(x), rtol=1e-6)
     assert np.all(own != known)
     np.testing.assert_allclose(own, known, atol=0.03)
 

@@ -29,6 +29,7 @@ from pegasus_jax.runs import config_io, store
 from pegasus_jax.runs.evaluation import evaluate_run
 from pegasus_jax.runs.train import train
 from pegasus_jax.tasks import circled
+from pegasus_jax.types import Cost
 from probes import cart, dial, tiny
 
 PAIRS = st.permutations(range(7)).flatmap(
@@ -119,7 +120,7 @@ def test_on_plants_of_gymnasium(
     drawn = np.asarray(jax.vmap(lambda key: start(key, task=task))(jax.random.split(jax.random.key(0), 20)))
     assert all(np.abs(task.starts - x).max(1).min() < 1e-6 for x in drawn)
     x = jnp.asarray(task.starts[3], float)
-    np.testing.assert_allclose(task.cost(x), upright(jnp.asarray(seen[3])), atol=1e-5)
+    np.testing.assert_allclose(task.cost.of_state(x), upright(jnp.asarray(seen[3])), atol=1e-5)
 
 
 def test_what_names_entries_of_the_observation_is_carried_over() -> None:
@@ -129,7 +130,7 @@ def test_what_names_entries_of_the_observation_is_carried_over() -> None:
         rates=(4, 5),
         start_mean=np.array([9.0, 0.0, -1.0, 2.0, 3.0, 4.0]),
         start_std=np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]),
-        cost=lambda x: x[1] + 10 * x[2] + 100 * x[3],
+        cost=Cost(lambda x: x[1] + 10 * x[2] + 100 * x[3]),
         stop=lambda x: x[5] > 1,
     )
     task = circled.of_angles(five, ((2, 1),))
@@ -138,7 +139,7 @@ def test_what_names_entries_of_the_observation_is_carried_over() -> None:
     np.testing.assert_allclose(task.start_mean, [9, np.pi, 2, 3, 4])
     np.testing.assert_allclose(task.start_std, [0.1, 0.2, 0.4, 0.5, 0.6])  # at 180 degrees only the sine moves
     x = jnp.array([9.0, 0.7, 2.0, 3.0, 4.0])
-    np.testing.assert_allclose(task.cost(x), np.sin(0.7) + 10 * np.cos(0.7) + 200, rtol=1e-6)
+    np.testing.assert_allclose(task.cost.of_state(x), np.sin(0.7) + 10 * np.cos(0.7) + 200, rtol=1e-6)
     assert task.stop is not None
     assert bool(task.stop(x))
     for pairs, says in ((((0, 6),), "circles=6 is not an entry"), (((3, 1),), "circles and angles both name 3")):

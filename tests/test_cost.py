@@ -23,24 +23,24 @@ number = st.floats(-5, 5, width=32)
 
 @given(number, number, st.floats(0.1, 3))
 def test_saturating_cost(a, b, width):
-    of_state = cost.saturating(lambda x: jnp.array([x[0], 2 * x[1]]), width)
+    of_state = cost.saturating(lambda x: jnp.array([x[0], 2 * x[1]]), width, ()).of_state
     expected = 1 - np.exp(-(a**2 + 4 * b**2) / (2 * width**2))
     np.testing.assert_allclose(of_state(jnp.array([a, b])), expected, atol=1e-5)
 
 
 def test_saturating_cost_is_flat_and_smooth_at_the_goal_and_far_away():
     """A distance would have no gradient at zero; its square has."""
-    of_state = cost.saturating(lambda x: x, 0.25)
+    of_state = cost.saturating(lambda x: x, 0.25, ()).of_state
     for point, value in ((jnp.zeros(3), 0.0), (jnp.full(3, 1e3), 1.0)):
         assert float(of_state(point)) == value
         assert np.array_equal(jax.grad(of_state)(point), np.zeros(3))
 
 
 def test_the_cost_of_every_particle():
-    of_state = cost.saturating(lambda x: x, 1.0)
+    saturating = cost.saturating(lambda x: x, 1.0, ())
     x = jnp.asarray(np.random.default_rng(1).normal(size=(3, 4, 2)), jnp.float32)
-    expected = [[float(of_state(x[t, k])) for k in range(4)] for t in range(3)]
-    np.testing.assert_allclose(cost.of_particles(of_state)(x), expected, rtol=1e-6)
+    expected = [[float(saturating.of_state(x[t, k])) for k in range(4)] for t in range(3)]
+    np.testing.assert_allclose(cost.of_particles(saturating)(x), expected, rtol=1e-6)
 
 
 def test_mean_and_total_differ_by_the_horizon():
@@ -92,7 +92,7 @@ def test_the_expected_cost_against_samples(name, x64):
     @jax.jit
     def moments(mean, cov):
         features = sincos(mean, cov, plant.angles)
-        expected = cost.expected_saturating(plant.error, plant.width, plant.angles)(mean, cov)
+        expected = cost.expectation(cost.saturating(plant.error, plant.width, plant.angles))(mean, cov)
         return features.mean, features.cov, cost.affine_error(plant.error, states, plant.angles), expected
 
     feature_mean, feature_cov, (matrix, offset), expected = moments(mean, cov)
@@ -101,7 +101,7 @@ def test_the_expected_cost_against_samples(name, x64):
     assert 0.02 < costs.mean() < 0.9
     assert float(expected) == pytest.approx(costs.mean(), abs=5 * costs.std() / count**0.5)
     x = noise.multivariate_normal(mean, cov, count)
-    of_states = jax.jit(jax.vmap(cost.saturating(plant.error, plant.width)))(x)
+    of_states = jax.jit(jax.vmap(cost.saturating(plant.error, plant.width, plant.angles).of_state))(x)
     assert float(expected) == pytest.approx(float(of_states.mean()), abs=0.02)
 
 
@@ -119,7 +119,7 @@ def test_the_expectation_by_nodes_of_a_quadratic_cost_is_exact(x64):
     noise = np.random.default_rng(5)
     (mean, slope), root, curve = noise.normal(size=(2, 3)), noise.normal(size=(3, 3)), noise.normal(size=(3, 3))
     cov = root @ root.T
-    expected = jax.jit(cost.expected_by_nodes(lambda x: x @ curve @ x + slope @ x + 7, 3))(mean, cov)
+    expected = jax.jit(cost.expected_by_nodes(lambda x: x @ curve @ x + slope @ x + 7))(mean, cov)
     known = mean @ curve @ mean + np.trace(curve @ cov) + slope @ mean + 7
     np.testing.assert_allclose(expected, known, rtol=1e-10)
 
@@ -129,8 +129,8 @@ def test_the_expectation_by_nodes_against_the_closed_form(name, x64):
     """And its gradient, which a search follows; the hundred particles of a search are several times as far off."""
     plant = PLANTS[name]()
     states, noise = len(plant.state_names), np.random.default_rng(6)
-    by_nodes = cost.expected_by_nodes(cost.saturating(lambda x: x[:2] - 0.3, 0.5), states)
-    closed = cost.expected_saturating(lambda x: x[:2] - 0.3, 0.5, ())
+    saturating = cost.saturating(lambda x: x[:2] - 0.3, 0.5, ())
+    by_nodes, closed = cost.expected_by_nodes(saturating.of_state), cost.expectation(saturating)
     root = 0.4 * noise.normal(size=(states, states))
     mean, cov = 0.5 * noise.normal(size=states), root @ root.T
     near, exact = (jax.jit(jax.value_and_grad(f, (0, 1)))(mean, cov) for f in (by_nodes, closed))
@@ -141,7 +141,7 @@ def test_the_expectation_by_nodes_against_the_closed_form(name, x64):
 
     def of_chance(seed: int) -> float:
         x = np.random.default_rng(seed).multivariate_normal(mean, cov, 100)
-        return float(jnp.mean(jax.vmap(cost.saturating(lambda x: x[:2] - 0.3, 0.5))(x)))
+        return float(jnp.mean(jax.vmap(saturating.of_state)(x)))
 
     off = np.std([of_chance(seed) for seed in range(20)])
     assert abs(float(near[0]) - float(exact[0])) < off / 3
@@ -150,9 +150,9 @@ def test_the_expectation_by_nodes_against_the_closed_form(name, x64):
 def test_the_cost_of_a_task_and_its_expectation_agree_where_the_state_is_known(x64):
     task = tasks.make("double_cartpole")
     x = np.random.default_rng(2).normal(size=(20, 6)) * 0.3
-    assert task.expected_cost is not None
-    known = jax.jit(jax.vmap(task.expected_cost, (0, None)))(x, np.zeros((6, 6)))
-    np.testing.assert_allclose(known, jax.vmap(task.cost)(x), atol=1e-12)
+    assert task.cost.expected is not None
+    known = jax.jit(jax.vmap(task.cost.expected, (0, None)))(x, np.zeros((6, 6)))
+    np.testing.assert_allclose(known, jax.vmap(task.cost.of_state)(x), atol=1e-12)
 
 
 def test_a_widened_cost_is_that_of_a_smaller_error(x64):
@@ -160,18 +160,19 @@ def test_a_widened_cost_is_that_of_a_smaller_error(x64):
     error = lambda x: jnp.array([x[0] - jnp.cos(x[1])])  # noqa: E731
     noise = np.random.default_rng(4)
     x, root = noise.normal(size=2), 0.3 * noise.normal(size=(2, 2))
-    of_state, of_gaussian = (jax.jit(lambda f, *a, i=i: cost.widened(error, 0.7, (1,), f)[i](*a)) for i in range(2))
-    third = lambda x: error(x) / 3  # noqa: E731
-    np.testing.assert_allclose(of_state(3.0, x), cost.saturating(third, 0.7)(x), rtol=1e-10)
-    expected = cost.expected_saturating(third, 0.7, (1,))(x, root @ root.T)
+    wide = lambda factor: cost.saturating(error, 0.7, (1,)).widen(factor)  # noqa: E731
+    of_state, of_gaussian = (jax.jit(lambda f, *a, i=i: wide(f)[i](*a)) for i in range(2))
+    third = cost.saturating(lambda x: error(x) / 3, 0.7, (1,))
+    np.testing.assert_allclose(of_state(3.0, x), third.of_state(x), rtol=1e-10)
+    expected = third.expected(x, root @ root.T)
     np.testing.assert_allclose(of_gaussian(3.0, x, root @ root.T), expected, rtol=1e-10)
 
 
 def test_the_matched_cost_is_that_of_the_particles_gaussian(x64):
-    expected = cost.expected_saturating(lambda x: jnp.array([x[0] - jnp.cos(x[1])]), 0.7, (1,))
+    saturating = cost.saturating(lambda x: jnp.array([x[0] - jnp.cos(x[1])]), 0.7, (1,))
     x = np.random.default_rng(3).normal(size=(3, 9, 2))
-    matched = jax.jit(cost.of_matched(expected))(x)
-    expected = jax.jit(expected)
+    matched = jax.jit(cost.of_matched(saturating))(x)
+    expected = jax.jit(saturating.expected)
     assert matched.shape == (3, 1)
     for t in range(3):
         np.testing.assert_allclose(matched[t, 0], expected(x[t].mean(0), np.cov(x[t].T)), rtol=1e-10)

@@ -76,7 +76,7 @@ def test_no_cost_environment_or_model_file_is_needed(tmp_path: Path) -> None:
     )
     assert pegasus_jax.controller(run)(X).shape == (1,)
     with pytest.raises(RunError, match="which was not imported"):
-        store.task_of(run).cost(jnp.zeros(4))
+        store.task_of(run).cost.of_state(jnp.zeros(4))
 
 
 def test_wrong_observations_are_refused(runs: dict[str, Path]) -> None:

@@ -27,7 +27,7 @@ def test_it_is_the_plant_and_the_controller_in_turn():
         np.testing.assert_allclose(flight.u[t], u, atol=1e-5)
         x = np.asarray(TASK.plant.step(x, u))
         np.testing.assert_allclose(flight.x[t + 1], x, atol=1e-5)
-        np.testing.assert_allclose(flight.cost[t], TASK.cost(x), atol=1e-5)  # of the states 1..H
+        np.testing.assert_allclose(flight.cost[t], TASK.cost.of_state(x), atol=1e-5)  # of the states 1..H
 
 
 def test_the_controller_and_the_data_see_sensor_noise_and_the_cost_does_not():

@@ -1,6 +1,6 @@
 """Every model with every policy, and each of them matched and not, and analytically: one loop serves them all."""
 
-from functools import cache, partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ import pytest
 
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.assembly.pieces import dynamics_of
-from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
+from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.presets import ALGORITHMS, MODELS, POLICIES
 from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import make
@@ -68,14 +68,11 @@ def composed(model, policy, how):
             "search.init": "previous",
         }
     config, task = config_io.parse(chosen | small), make("cartpole")
-    error, angles = task.plant.error, task.angles
     task = task._replace(
         horizon=HORIZON,
         start_mean=UPRIGHT,
         start_std=np.full(4, 0.02),
-        cost=saturating(error, WIDTH),
-        expected_cost=expected_saturating(error, WIDTH, angles),
-        cost_with_width=partial(widened, error, WIDTH, angles),
+        cost=saturating(task.plant.error, WIDTH, task.angles),
     )
     dynamics = dynamics_of(config.model, task)
     apply, moments = Counter(dynamics.apply), dynamics.moments and Counter(dynamics.moments)

@@ -17,7 +17,7 @@ from pegasus_envs.gym_plant import env_plant, env_spec, make_env, period
 from pegasus_jax import episode, interrupt
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.runs import config_io, store
-from pegasus_jax.types import Task
+from pegasus_jax.types import Cost, Task
 from probes import cart, tiny
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
@@ -71,7 +71,7 @@ def task_of(env: str, states: int, horizon: int = 9, low: float = -2.0, high: fl
         name=env,
         plant=None,
         environment=env_plant(env, (), states),
-        cost=lambda x: x[0] ** 2,
+        cost=Cost(lambda x: x[0] ** 2, widen=lambda factor: Cost(lambda x: (x[0] / factor) ** 2)),
         state_names=tuple(f"x{i}" for i in range(states)),
         control_low=np.array([low]),
         control_high=np.array([high]),

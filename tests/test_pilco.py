@@ -15,7 +15,7 @@ from pegasus_jax.math import angles, gaussian
 from pegasus_jax.pilco import search
 from pegasus_jax.pilco.rbf import NOISE, rbf
 from pegasus_jax.policies.squash import SQUASHES, to_limits
-from pegasus_jax.types import Learner, Policy
+from pegasus_jax.types import Cost, Learner, Policy
 from probes import PENDULUM, SCALAR, known, linear_policy, same
 
 D, F, POINTS, UNITS = 3, 4, 12, 6  # the last state is an angle; one control
@@ -255,13 +255,11 @@ def test_many_steps_agree_with_the_published_formulas():
 
 
 def test_the_gradient_equals_finite_differences():
-    expected = costs.expected_saturating(lambda x: jnp.array([x[0] - 1, jnp.sin(x[2]), x[1]]), 1.0, (2,))
+    cost = costs.saturating(lambda x: jnp.array([x[0] - 1, jnp.sin(x[2]), x[1]]), 1.0, (2,))
 
     @jax.jit
     def value(params):
-        return search.objective(
-            params, 1.0, (MEAN, COV), STD, horizon=4, expected_cost=expected, noise=NoiseUse(1.0, 0.5), **PIECES
-        )
+        return search.objective(params, 1.0, (MEAN, COV), STD, horizon=4, cost=cost, noise=NoiseUse(1.0, 0.5), **PIECES)
 
     params = jax.tree.map(jnp.asarray, policy_params())
     gradient = jax.jit(jax.grad(value))(params)
@@ -317,7 +315,7 @@ def test_a_linear_plant_is_propagated_exactly(plant, noise):
         start,
         std,
         horizon=plant.horizon,
-        expected_cost=spread,
+        cost=Cost(lambda x: x @ plant.q @ x, spread),
         noise=noise,
         aggregate=costs.total,
         **pieces,
@@ -335,7 +333,7 @@ def linear_search(plant):
     def value(gain, posterior, std):
         return posterior * search.objective(
             gain, None, start, std, horizon=plant.horizon, **linear_pieces(plant),
-            expected_cost=lambda mean, cov: mean @ plant.q @ mean + jnp.trace(plant.q @ cov),
+            cost=Cost(lambda x: x @ plant.q @ x, lambda mean, cov: mean @ plant.q @ mean + jnp.trace(plant.q @ cov)),
         )  # fmt: skip
 
     searcher = search.analytic(value, lambda key, posterior: jnp.zeros(len(plant.mean)))

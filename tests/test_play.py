@@ -16,7 +16,7 @@ from pegasus_envs import mjcf_plant
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import make
-from pegasus_jax.types import Trajectory
+from pegasus_jax.types import Cost, Trajectory
 from pegasus_jax.viz.video import HEIGHT, STRIP, WIDTH, composed, performance, pictures, strip
 from test_train import call
 
@@ -62,7 +62,7 @@ def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
         words |= {"task": "mjcf", **plant}
     experiment = build(config_io.parse(words))
     params = experiment.init(jax.random.key(0)).policy.params
-    task = experiment.task._replace(horizon=2, cost=lambda x: x[0])
+    task = experiment.task._replace(horizon=2, cost=Cost(lambda x: x[0]))
     perform = jax.jit(partial(performance, task=task, policy=experiment.policy))
     _, states = perform(jax.random.key(1), params)
     drawn = np.array(pictures(task, states, 64, 48), int)

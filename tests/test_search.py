@@ -18,7 +18,7 @@ from pegasus_jax.imagine.scenarios import Sampler, sampler
 from pegasus_jax.learn.gradient import gradient_search
 from pegasus_jax.learn.schedule import search_table
 from pegasus_jax.learn.search import Problem, searcher
-from pegasus_jax.types import Learner, Period, Scenarios
+from pegasus_jax.types import Cost, Learner, Period, Scenarios
 from probes import (
     EMITTERS,
     PENDULUM,
@@ -108,7 +108,7 @@ def linear_objective(plant, particles):
         dynamics=dynamics,
         policy=policy,
         match=matching.match,
-        cost=costs.of_particles(lambda x: x @ jnp.asarray(plant.q, x.dtype) @ x),
+        cost=costs.of_particles(Cost(lambda x: x @ jnp.asarray(plant.q, x.dtype) @ x)),
     )
     return value, blocks
 
@@ -165,7 +165,7 @@ def test_a_known_control_is_found_through_limits_and_costs():
     """One step of the cart probe, from rest at 1 m: the best force within the limits is a number."""
     task = cart(horizon=1)
     start = jnp.array([1.0, 0.0])
-    cost_of = lambda u: task.cost(task.plant.step(start, u))  # noqa: E731
+    cost_of = lambda u: task.cost.of_state(task.plant.step(start, u))  # noqa: E731
     grid = np.linspace(-2, 2, 4001, dtype=np.float32)[:, None]
     best = grid[np.argmin(jax.vmap(cost_of)(grid))]
     optimizer = optax.adam(0.05)

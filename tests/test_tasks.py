@@ -46,7 +46,7 @@ def test_a_task_builds(name: str, legs: int, states: int, controls: int, horizon
     task = experiment.task
     assert (len(task.state_names), len(task.control_names), task.horizon, task.dt) == (states, controls, horizon, dt)
     start = jnp.asarray(task.start_mean, jnp.float32)
-    assert 0.5 < task.cost(start) <= 1
+    assert 0.5 < task.cost.of_state(start) <= 1
     assert jax.eval_shape(experiment.init, jax.random.key(0)).data.x.shape[1] == states
     policy = experiment.policy
     push = jax.tree.map(lambda leaf: 1e3 * jnp.ones_like(leaf), policy.init(jax.random.key(0)))

@@ -200,7 +200,7 @@ def test_imagination_is_fresh_and_of_the_state(watched, looped):
     imagine = jax.jit(watched.exp.imagine)
     imagined, costs = imagine(looped[0][3])
     assert imagined.x.shape == (9, 5, 2)
-    np.testing.assert_allclose(costs[2, 3], watched.exp.task.cost(imagined.x[3, 3]), rtol=1e-5)
+    np.testing.assert_allclose(costs[2, 3], watched.exp.task.cost.of_state(imagined.x[3, 3]), rtol=1e-5)
     again, _ = imagine(looped[0][3])
     other, _ = imagine(looped[0][2])
     assert same(imagined, again)
@@ -282,7 +282,8 @@ def test_a_search_starts_from_the_better_of_the_old_policy_and_a_fresh_one(offse
     The cost is the distance of the state from 1, the old policy drives it there or, off by `offset`, far away. The
     step size is so small that nothing moves.
     """
-    task = cart(horizon=4)._replace(cost=lambda x: 1 - jnp.exp(-jnp.sum((x - 1) ** 2)))
+    task = cart(horizon=4)
+    task = task._replace(cost=task.cost._replace(of_state=lambda x: 1 - jnp.exp(-jnp.sum((x - 1) ** 2))))
     towards = Policy(
         init=lambda key: {"aim": jnp.full(2, -3.0)},
         sample=lambda key: (),

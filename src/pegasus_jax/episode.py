@@ -48,7 +48,7 @@ def run_with_trace(
         after = measure(sensor_key, state)
         seen = plant.observe(state)
         over = jnp.zeros((), bool) if task.stop is None else task.stop(seen) > 0.5
-        cost = task.cost(seen)
+        cost = task.cost.of_state(seen)
         check_shape("the cost of one state", cost, ())
         return (state, after), (after, u, cost, over, looked)
 

@@ -105,7 +105,7 @@ def experiment(
         jax.jit(explore),
         jax.jit(lambda key: jax.vmap(policy.sample)(jax.random.split(key, task.horizon))),
     )
-    react, cost_of = jax.jit(policy.apply), jax.jit(jax.vmap(task.cost))
+    react, cost_of = jax.jit(policy.apply), jax.jit(jax.vmap(task.cost.of_state))
 
     def drive(key: Key, policy_params: Params, exploring: bool) -> Episode:
         """An episode on the environment, with the costs of its rows."""

@@ -123,10 +123,9 @@ class Cost(NamedTuple):
     """What a search is to make small: a differentiable function of one state, in [0, 1]."""
 
     of_state: Callable[[Array], Array]  # x [D] -> scalar
-    # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not in closed form, but by cost.expected_by_nodes
+    # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not in closed form, but by costs.expected_by_nodes
     expected: Callable[[Array, Array], Array] | None = None
-    # A factor -> (of_state, expected) of the same error with that many times the width. None: the cost has no width.
-    with_width: Callable[[Array], tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]] | None = None
+    widen: "Callable[[Array], Cost] | None" = None  # factor -> the cost of that many times the width; None: it has none
 
 
 class Task(NamedTuple):
@@ -136,7 +135,7 @@ class Task(NamedTuple):
     # reset(key) -> state; step(state, u [U]) -> state; observe(state) -> x [D]. None: `environment`, or somebody else,
     # supplies the episodes.
     plant: Any
-    cost: Callable[[Array], Array]  # x [D] -> scalar in [0, 1]
+    cost: Cost
     angles: tuple[int, ...]  # the dimensions of x that are angles [rad]
     start_mean: Any  # [D]
     start_std: Any  # [D]
@@ -150,10 +149,6 @@ class Task(NamedTuple):
     # The entries of x that are rates of its other entries, in the order of those; (): x is not made of such pairs.
     rates: tuple[int, ...] = ()
     success: float = 0.2  # a rollout whose last five steps cost less than this on average has succeeded
-    # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not in closed form, but by cost.expected_by_nodes
-    expected_cost: Callable[[Array, Array], Array] | None = None
-    # A factor -> (cost, expected_cost) of the same error with that many times the width. None: the cost has no width.
-    cost_with_width: Callable[[Array], tuple[Callable[[Array], Array], Callable[[Array, Array], Array]]] | None = None
     # reset(seed) -> x [D]; step(u [U]) -> (x [D], the control sent [U], how it ended or ""); close(). A plant outside
     # of JAX, of which there is one: a Gymnasium environment, maybe a robot.
     environment: Any = None

@@ -1,5 +1,6 @@
 """Config -> Experiment: the pieces that the settings name, or your own, composed."""
 
+from collections.abc import Callable
 from functools import lru_cache, partial
 
 import jax
@@ -12,7 +13,7 @@ from pegasus_jax.assembly.searchers import limits, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import experiment
 from pegasus_jax.sharding import over_particles
-from pegasus_jax.types import Cost, Dynamics, Experiment, Fitter, Policy, Searcher, Task
+from pegasus_jax.types import Array, Cost, Dynamics, Experiment, Fitter, Policy, Searcher, Task
 
 EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 
@@ -31,16 +32,17 @@ def compose(
     policy: Policy | None = None,
     fitter: Fitter | None = None,
     searcher: Searcher | None = None,
-    cost: Cost | None = None,
+    cost: Cost | Callable[[Array], Array] | None = None,
     mesh: Mesh | None = None,
 ) -> Experiment:
     """The experiment of a config on any task, with pieces of your own in place of the configured or the task's ones.
 
-    A `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
+    A `cost` may be a function of one state x [D]. A `searcher` improves the policy for `config.search.steps` steps;
+    what is imagined after a search is as configured.
     With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
     does not suit the config: a cost without a width, for example, needs `search.cost_width_start=1`.
     """
-    task = task if cost is None else with_cost(task, cost)
+    task = task._replace(cost=as_cost(task.cost if cost is None else cost))
     dynamics = dynamics or dynamics_of(config.model, task)
     policy = policy or policy_of(config.policy, task)
     configured, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
@@ -62,11 +64,11 @@ def compose(
     )
 
 
-def with_cost(task: Task, cost: Cost) -> Task:
-    """The task with another cost. Raises ConfigError for a bare function."""
-    if not isinstance(cost, Cost):
-        raise ConfigError(f"cost={cost!r} is no Cost; a function of one state x [D] makes one: Cost(function)")
-    return task._replace(cost=cost.of_state, expected_cost=cost.expected, cost_with_width=cost.with_width)
+def as_cost(cost: Cost | Callable[[Array], Array]) -> Cost:
+    """The cost itself, or that of a function of one state x [D]. Raises ConfigError for what is neither."""
+    if not isinstance(cost, Cost) and not callable(cost):
+        raise ConfigError(f"cost={cost!r} is no Cost; expected one, or a function of one state x [D]")
+    return cost if isinstance(cost, Cost) else Cost(cost)
 
 
 def set_precision(config: settings.Config) -> None:

@@ -130,11 +130,11 @@ def analytic_search_of(
             **pieces,
             horizon=task.horizon,
             angles=task.angles,
-            expected_cost=expected,
+            cost=task.cost,
             noise=noise,
         )
 
-    begin, expected = (mean, jnp.diag(std**2)), expected_cost_of(task)
+    begin = mean, jnp.diag(std**2)
     blocks = blocks_of(search.particles, task, dynamics, policy)
     imagine = partial(imagined, **pieces, blocks=blocks, task=task, match=matching.keep, noise=noise)
     return pilco.analytic(value, noise_std, restart=search.init == "better"), imagine
@@ -145,22 +145,18 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
 
     Raises ConfigError where the task's cost has no width.
     """
-    if search.cost_width_start > 1 and task.cost_with_width is None:
+    if search.cost_width_start > 1 and task.cost.widen is None:
         raise ConfigError(
             f"search.cost_width_start={search.cost_width_start:g} needs a cost with a width,"
             f" which that of task={task.name} lacks; the nearest is 1"
         )
 
     def costs(refining: Array | None, width: Array | None) -> Callable[[Array], Array]:
-        of_state, expected = task.cost, expected_cost_of(task)
-        if width is not None and task.cost_with_width is not None:
-            of_state, expected = task.cost_with_width(width)
-        each = cost.of_particles(of_state)
+        now = task.cost if width is None or task.cost.widen is None else task.cost.widen(width)
+        each = cost.of_particles(now)
         if search.cost_estimator != "gaussian":
             return until_stop(task, each)
-        return until_stop(
-            task, either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), cost.of_matched(expected))
-        )
+        return until_stop(task, either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), cost.of_matched(now)))
 
     return costs
 
@@ -170,11 +166,6 @@ def until_stop(task: Task, costs: Callable[[Array], Array]) -> Callable[[Array],
     if task.stop is None:
         return costs
     return lambda x: cost.until_stop(costs(x), x, task.stop, task.stop_cost)  # type: ignore[arg-type]
-
-
-def expected_cost_of(task: Task) -> cost.Expected:
-    """The task's expected cost of a Gaussian state: in closed form where that is known, else by nodes."""
-    return task.expected_cost or cost.expected_by_nodes(task.cost, len(task.state_names))
 
 
 def blocks_of(

@@ -10,33 +10,41 @@ import numpy as np
 from pegasus_jax.math.gaussian import saturating_cost, sincos
 from pegasus_jax.math.linalg import cholesky, mean_and_cov
 from pegasus_jax.shapes import check_shape
-from pegasus_jax.types import Array
+from pegasus_jax.types import Array, Cost
 
 __all__ = [
+    "expectation",
     "expected_by_nodes",
-    "expected_saturating",
     "mean",
     "of_matched",
     "of_particles",
     "saturating",
     "total",
     "until_stop",
-    "widened",
 ]
 
-Cost = Callable[[Array], Array]  # x [D] -> scalar
+OfState = Callable[[Array], Array]  # x [D] -> scalar
 Error = Callable[[Array], Array]  # x [D] -> e [E], affine in the features of x
 Expected = Callable[[Array, Array], Array]  # (mean [D], cov [D, D]) of a Gaussian state -> scalar
 
 
-def saturating(error: Error, width: Array | float) -> Cost:
-    """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; docs/reference.md 1.3)."""
+def saturating(error: Error, width: Array | float, angles: tuple[int, ...]) -> Cost:
+    """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; docs/reference.md 1.3).
 
-    def cost(x: Array) -> Array:
+    Its expectation is PILCO's: the sines and cosines of the state's `angles` are taken for Gaussian, with their exact
+    moments. So it is exact without angles, and as close as that is with them.
+    """
+
+    def of_state(x: Array) -> Array:
         e = error(x) / width
         return 1 - jnp.exp(-0.5 * jnp.sum(e * e))
 
-    return cost
+    def expected(mean: Array, cov: Array) -> Array:
+        features = sincos(mean, cov, angles)
+        matrix, offset = (a.astype(mean.dtype) for a in affine_error(error, mean.shape[0], angles))
+        return saturating_cost(features.mean, features.cov, matrix, offset, width)
+
+    return Cost(of_state, expected, lambda factor: saturating(error, width * factor, angles))
 
 
 def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Array, Array]:
@@ -55,35 +63,21 @@ def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Ar
     return jnp.concatenate([linear, (up - down) / 2, cosine]).T, origin - jnp.sum(cosine, 0)
 
 
-def expected_saturating(error: Error, width: Array | float, angles: tuple[int, ...]) -> Expected:
-    """The expectation of `saturating(error, width)` of a Gaussian state, as PILCO has it (docs/reference.md 1.3).
-
-    The features of the state are taken for Gaussian, with their exact moments: exact without angles, and as close as
-    that is with them.
-    """
-
-    def expected(mean: Array, cov: Array) -> Array:
-        features = sincos(mean, cov, angles)
-        matrix, offset = (a.astype(mean.dtype) for a in affine_error(error, mean.shape[0], angles))
-        return saturating_cost(features.mean, features.cov, matrix, offset, width)
-
-    return expected
+def expectation(cost: Cost) -> Expected:
+    """The expected cost of a Gaussian state: in closed form where that is known, else by nodes."""
+    return cost.expected or expected_by_nodes(cost.of_state)
 
 
-def widened(error: Error, width: float, angles: tuple[int, ...], factor: Array | float) -> tuple[Cost, Expected]:
-    """`saturating` and `expected_saturating` of the same error, `factor` times as wide."""
-    return saturating(error, width * factor), expected_saturating(error, width * factor, angles)
-
-
-def expected_by_nodes(cost: Cost, states: int, nodes: int = 512) -> Expected:
+def expected_by_nodes(of_state: OfState, *, nodes: int = 512) -> Expected:
     """The expectation of any cost of a Gaussian state x [D]: the mean over as many fixed nodes, at least 2 D.
 
     Quasi-Monte Carlo with `normal_nodes`: exact for a cost that is a constant, linear or quadratic in x.
     """
 
     def expected(mean: Array, cov: Array) -> Array:
+        states = mean.shape[0]
         z = normal_nodes(max(nodes, 2 * states), states)
-        return jnp.mean(jax.vmap(cost)(mean + z.astype(mean.dtype) @ cholesky(cov).T))
+        return jnp.mean(jax.vmap(of_state)(mean + z.astype(mean.dtype) @ cholesky(cov).T))
 
     return expected
 
@@ -103,10 +97,10 @@ def normal_nodes(count: int, size: int) -> np.ndarray:
 
 
 def of_particles(cost: Cost) -> Callable[[Array], Array]:
-    """The cost of every particle: x [H, K, D] -> [H, K]. Raises ValueError where `cost` returns no scalar."""
+    """The cost of every particle: x [H, K, D] -> [H, K]. Raises ValueError where a state's cost is no scalar."""
 
     def one(x: Array) -> Array:
-        value = cost(x)
+        value = cost.of_state(x)
         check_shape("the cost of one state", value, ())
         return value
 
@@ -124,8 +118,9 @@ def until_stop(costs: Array, x: Array, stop: Callable[[Array], Array], stop_cost
     return running * costs + (1 - running) * stop_cost
 
 
-def of_matched(expected: Expected) -> Callable[[Array], Array]:
+def of_matched(cost: Cost) -> Callable[[Array], Array]:
     """The expected cost of the Gaussian with the particles' mean and covariance: x [H, K, D] -> [H, 1]."""
+    expected = expectation(cost)
     return jax.vmap(lambda x: expected(*mean_and_cov(x))[None])
 
 

@@ -17,7 +17,7 @@ from pegasus_jax.imagine.rollout import NoiseUse
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.math.gaussian import Image, chain, joint, residual, sincos
 from pegasus_jax.pilco import lbfgs
-from pegasus_jax.types import Array, Dynamics, Key, Learner, Params, Policy, Searcher
+from pegasus_jax.types import Array, Cost, Dynamics, Key, Learner, Params, Policy, Searcher
 
 
 class Gaussians(NamedTuple):
@@ -94,14 +94,14 @@ def objective(
     dynamics: Dynamics,
     policy: Policy,
     angles: tuple[int, ...],
-    expected_cost: Callable[[Array, Array], Array],
+    cost: Cost,
     aggregate: Callable[[Array], Array] = costs.mean,
     noise: NoiseUse = NoiseUse(),
 ) -> Array:
     """J(theta): the expected cost of the steps 1..H, [H, 1], made one number by `aggregate`."""
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, angles=angles)
     states = propagate(policy_params, posterior, start, std, horizon=horizon, noise=noise, **pieces)
-    return aggregate(jax.vmap(expected_cost)(states.mean[1:], states.cov[1:])[:, None])
+    return aggregate(jax.vmap(costs.expectation(cost))(states.mean[1:], states.cov[1:])[:, None])
 
 
 def analytic(

@@ -36,7 +36,7 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
         task.success,
         task.circles,
     )
-    notes = cost_check.notes(task.cost, facts, f"cost={config.cost}")
+    notes = cost_check.notes(task.cost.of_state, facts, f"cost={config.cost}")
     stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)
@@ -139,7 +139,7 @@ def report(config: Config) -> list[str]:
         ),
         "time": f"{task.horizon} periods of {task.dt:g} s an episode, {task.horizon * task.dt:g} s",
         "start": f"{_numbers(task.start_mean)}, give or take {_numbers(task.start_std)}",
-        "cost there": f"{float(task.cost(start)):.4g}; below {task.success:g} is success",
+        "cost there": f"{float(task.cost.of_state(start)):.4g}; below {task.success:g} is success",
     }
     return [*(f"{name:>12}  {value}" for name, value in facts.items()), *(f"{'note':>12}  {note}" for note in notes)]
 

@@ -79,7 +79,7 @@ def costed(job: Job, ran: Episode, trial: int) -> Episode:
     if np.isfinite(ran.trajectory.cost).all():
         return ran
     x = np.asarray(ran.trajectory.x)
-    cost = np.asarray(jax.vmap(job.experiment.task.cost)(jnp.asarray(x[1:])))
+    cost = np.asarray(jax.vmap(job.experiment.task.cost.of_state)(jnp.asarray(x[1:])))
     for (t,) in np.argwhere(~np.isfinite(cost))[:1]:
         seen = to_observation(x[t + 1], job.experiment.task.circles).tolist()
         found = f"the cost of the observation {seen} is {cost[t]}"

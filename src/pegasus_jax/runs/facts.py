@@ -55,9 +55,10 @@ def to_task(found: Any, where: str) -> Task:
         }
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{where} is damaged: its task has no usable {str(error) or 'facts'}") from error
-    from pegasus_jax.types import Task
+    from pegasus_jax.types import Cost, Task
 
-    return Task(plant=None, cost=unknown_cost, cost_with_width=lambda _: (unknown_cost, unknown_cost), **known)
+    cost = Cost(unknown_cost, unknown_cost, lambda factor: cost)  # as wide as may be asked: it is never computed
+    return Task(plant=None, cost=cost, **known)
 
 
 def unknown_cost(*_: Any) -> Any:

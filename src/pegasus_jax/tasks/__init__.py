@@ -13,10 +13,10 @@ import numpy as np
 from pegasus_jax import interrupt
 from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
-from pegasus_jax.imagine.costs import expected_saturating, saturating, widened
+from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.math import circles
 from pegasus_jax.tasks import circled, user_code
-from pegasus_jax.types import Task
+from pegasus_jax.types import Cost, Task
 
 if TYPE_CHECKING:
     from pegasus_envs.plant import Plant
@@ -29,7 +29,7 @@ def of_plant(name: str, plant: "Plant") -> Task:
     return Task(
         name=name,
         plant=plant,
-        cost=saturating(plant.error, plant.width),
+        cost=saturating(plant.error, plant.width, plant.angles),
         angles=plant.angles,
         start_mean=plant.start_mean,
         start_std=plant.start_std,
@@ -41,8 +41,6 @@ def of_plant(name: str, plant: "Plant") -> Task:
         state_names=plant.state_names,
         control_names=plant.control_names,
         rates=plant.rates,
-        expected_cost=expected_saturating(plant.error, plant.width, plant.angles),
-        cost_with_width=partial(widened, plant.error, plant.width, plant.angles),
     )
 
 
@@ -311,7 +309,7 @@ def _of_users(
     return Task(
         name=name,
         plant=plant,
-        cost=user_code.load("cost", config.cost or ""),
+        cost=Cost(user_code.load("cost", config.cost or "")),
         angles=_entries("angles", config.angles, name, len(states)),
         start_mean=about.start_mean,
         start_std=about.start_std,

@@ -8,7 +8,7 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.math import circles as pairs
-from pegasus_jax.types import Task
+from pegasus_jax.types import Cost, Task
 
 
 def of_angles(task: Task, circles: pairs.Circles) -> Task:
@@ -27,7 +27,7 @@ def of_angles(task: Task, circles: pairs.Circles) -> Task:
         return wraps(function)(lambda x: function(pairs.to_observation(x, circles)))
 
     return task._replace(
-        cost=of_observation(task.cost),
+        cost=Cost(of_observation(task.cost.of_state)),
         stop=None if task.stop is None else of_observation(task.stop),
         environment=_environment(task.environment, circles),
         angles=tuple(sorted(angles)),
