@@ -33,11 +33,11 @@ from benchmarks.workloads import ALIKE, workload
 from pegasus_jax import sharding
 from pegasus_jax.assembly.experiments import build, compose, set_precision
 from pegasus_jax.config import Config
-from pegasus_jax.experiment import EVALUATE, trial_key
+from pegasus_jax.experiment import EVALUATE, Experiment, trial_key
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import FAST_RUN, Jitted, compiler_options, over_seeds, shard
-from pegasus_jax.types import Array, Experiment, RunState
+from pegasus_jax.types import Array, RunState
 
 Row = dict[str, Any]
 Report = Callable[[str, Row], None]  # (the row's name, the row) -> printed and on disk

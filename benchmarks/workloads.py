@@ -17,12 +17,13 @@ from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.assembly.searchers import blocks_of
 from pegasus_jax.config import Config
+from pegasus_jax.experiment import Experiment
 from pegasus_jax.imagine import costs, matching
 from pegasus_jax.imagine.objective import objective
 from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.math.angles import encode
 from pegasus_jax.runs import config_io
-from pegasus_jax.types import Array, Cost, Experiment, Params, Period, RunState, Scenarios, Task, Trajectory
+from pegasus_jax.types import Array, Cost, Params, Period, RunState, Scenarios, Task, Trajectory
 
 # Every iteration alike, as the paper's and the peers' are: what a search refines by is another program.
 ALIKE = {"search.standardized_noise": "false", "search.refine_fraction": "0", "search.init": "better"}

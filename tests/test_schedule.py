@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pegasus_jax.imagine.objective import either
-from pegasus_jax.learn.schedule import COARSE, CURRENT, EVALUATE, FRESH, START, STEP, first_rows, search_table, text
+from pegasus_jax.learn.schedule import COARSE, CURRENT, EVALUATE, FRESH, START, STEP, first_rows, search_table
+from pegasus_jax.viz.search_table import text
 
 
 def visits(**settings):
@@ -30,7 +31,7 @@ def test_the_plain_table_is_the_printed_algorithm():
 def test_a_search_starts_from_the_policy_it_is_told():
     assert visits(init="better") == [(0, 0, EVALUATE, CURRENT), (0, 0, EVALUATE, FRESH), *STEPS]
     assert visits(init="fresh") == [(0, 0, STEP, FRESH), *STEPS[1:]]
-    with pytest.raises(ValueError, match=r"init='old'; choose from previous, better, fresh"):
+    with pytest.raises(ValueError, match=r"init=old is not a choice; .*choices: previous, better, fresh"):
         search_table(4, init="old")
 
 
@@ -92,7 +93,8 @@ def test_after_annealed_searches_each_has_its_own_step_size_and_limit():
 
 def test_a_table_can_be_read_without_jax():
     code = (
-        "import sys; from pegasus_jax.learn.schedule import search_table, text;"
+        "import sys; from pegasus_jax.learn.schedule import search_table\n"
+        "from pegasus_jax.viz.search_table import text\n"
         "print(text(search_table(2, init='better', refine=1, cost_width_start=2))); assert 'jax' not in sys.modules"
     )
     lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()

@@ -10,6 +10,7 @@ import pytest
 
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import RunError
+from pegasus_jax.episode import Episode
 from pegasus_jax.experiment import run
 from pegasus_jax.runs import checkpoint, store, writers
 from pegasus_jax.runs.display import Display
@@ -18,7 +19,7 @@ from pegasus_jax.runs.programs import Program
 from pegasus_jax.runs.train import learn
 from pegasus_jax.runs.writers import Writer
 from pegasus_jax.studies.study import one_json, rounded
-from pegasus_jax.types import Episode, RunState, Trajectory
+from pegasus_jax.types import RunState, Trajectory
 from probes import cart, same, tiny, unchecked
 
 SEEDS, TRIALS = [5, 6], 2

@@ -13,7 +13,8 @@ if TYPE_CHECKING:
     from pegasus_jax.assembly.pieces import dynamics_of, policy_of
     from pegasus_jax.checks import ConfigError, RunError
     from pegasus_jax.config import Config
-    from pegasus_jax.experiment import TrialInfo, run, trial
+    from pegasus_jax.episode import Episode
+    from pegasus_jax.experiment import Experiment, Successor, TrialInfo, run, trial
     from pegasus_jax.imagine import costs, matching
     from pegasus_jax.imagine.objective import objective
     from pegasus_jax.imagine.rollout import NoiseUse, rollout
@@ -42,8 +43,6 @@ if TYPE_CHECKING:
         Dataset,
         Dropout,
         Dynamics,
-        Episode,
-        Experiment,
         Fitter,
         Learner,
         Period,
@@ -53,7 +52,6 @@ if TYPE_CHECKING:
         RunState,
         Scenarios,
         Searcher,
-        Successor,
         Task,
         Trajectory,
     )
@@ -65,9 +63,10 @@ _NAMES = {
     "presets": "preset",
     "assembly.experiments": "build compose",
     "assembly.pieces": "dynamics_of policy_of",
-    "experiment": "run trial TrialInfo",
+    "experiment": "run trial Experiment Successor TrialInfo",
     "checks": "ConfigError RunError",
     "runs.controller": "controller Controller",
+    "episode": "Episode",
     # the method, function by function
     "imagine.scenarios": "blocks Blocks draw sampler Sampler",
     "imagine.rollout": "rollout NoiseUse",
@@ -87,8 +86,8 @@ _NAMES = {
     "policies.wrap": "of_pair",
     "pilco.rbf": "rbf",
     # the values that pass between them
-    "types": "Task Cost Trajectory Episode Dataset Batch Dynamics Prediction Dropout Policy Scenarios Period Rollout"
-    " Learner Fitter Searcher Experiment RunState Successor",
+    "types": "Task Cost Trajectory Dataset Batch Dynamics Prediction Dropout Policy Scenarios Period Rollout"
+    " Learner Fitter Searcher RunState",
 }
 # Families of functions, each a module under a name of its own: `pegasus_jax.costs.mean`.
 _FAMILIES = {

@@ -1,7 +1,7 @@
 """One episode of a controller: on a plant in JAX, as one pure function, or on an environment, step by step."""
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,9 +9,17 @@ import numpy as np
 
 from pegasus_jax import interrupt
 from pegasus_jax.shapes import check_shape
-from pegasus_jax.types import Array, Episode, Key, Task, Trajectory
+from pegasus_jax.types import Array, Key, Task, Trajectory
 
 CUT = ("error", "interrupted")  # how an episode can end by no doing of its policy
+
+
+class Episode(NamedTuple):
+    """An episode on an environment, and why it is over."""
+
+    trajectory: Trajectory
+    ended: str = "horizon"  # or terminated, truncated; error, interrupted
+    error: BaseException | None = None  # what it was raised
 
 
 def run(key: Key, act: Callable[[Key, Array, Array], Array], task: Task) -> Trajectory:

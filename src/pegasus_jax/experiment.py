@@ -1,7 +1,7 @@
 """The loop of Alg. 1 as three seams: collect (the plant), add_episode (the data), improve (the mind)."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +10,7 @@ import optax
 from jax.core import Tracer
 
 from pegasus_jax import episode
+from pegasus_jax.episode import Episode
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
@@ -19,8 +20,6 @@ from pegasus_jax.types import (
     Array,
     Dataset,
     Dynamics,
-    Episode,
-    Experiment,
     Fitter,
     Key,
     Learner,
@@ -29,13 +28,43 @@ from pegasus_jax.types import (
     Rollout,
     RunState,
     Searcher,
-    Successor,
     Task,
     Trajectory,
 )
 
 # What the key of a trial is folded with, so that no two draws share a key.
 COLLECT, FIT, SEARCH, IMAGINE, EVALUATE, RESTART, CALIBRATE = range(7)
+
+
+class Successor(NamedTuple):
+    """What a policy is expected to do on fresh scenarios, and what the one before it would have."""
+
+    rollout: Rollout  # of the policy that goes on
+    cost: Array  # [H, K] of that rollout
+    incumbent: Array  # [] expected cost a step of the policy before the search; NaN where it was not asked for
+    replaced: Array  # [] whether the search's policy took its place
+
+
+class Experiment(NamedTuple):
+    """One configured method on one task: pure functions, closed over their pieces by `build`."""
+
+    task: Task
+    dynamics: Dynamics
+    policy: Policy
+    init: Callable[[Key], RunState]
+    episode: Callable[[Key, Params, Array | bool], Trajectory]  # (key, policy parameters, random controls?)
+    collect: Callable[[RunState], Trajectory]  # Alg. 1 line 3; with `episode`, the only one that touches the plant
+    add_episode: Callable[[RunState, Trajectory], RunState]  # Alg. 1 line 4
+    fit: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 5
+    search: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 6
+    # (state, policy parameters before the search) -> (state with the policy that goes on, Successor)
+    succeed: Callable[[RunState, Params], tuple[RunState, Successor]]
+    improve: Callable[[RunState], tuple[RunState, Any]]  # fit, search, succeed
+    imagine: Callable[[RunState], tuple[Rollout, Array]]  # fresh scenarios -> (rollout, cost [H, K])
+    calibrate: Callable[[RunState, Trajectory], Array]  # of the model, on an episode not yet added -> calibration
+    # `episode` on the task's environment, which says how it ended and keeps the rows of one that failed; None: the
+    # plant is in JAX
+    drive: Callable[[Key, Params, bool], Episode] | None = None
 
 
 class TrialInfo(NamedTuple):

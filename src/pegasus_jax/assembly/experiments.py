@@ -11,9 +11,9 @@ from pegasus_jax import episode, tasks
 from pegasus_jax.assembly.pieces import dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import limits, search_of
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.experiment import experiment
+from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.sharding import over_particles
-from pegasus_jax.types import Array, Cost, Dynamics, Experiment, Fitter, Policy, Searcher, Task
+from pegasus_jax.types import Array, Cost, Dynamics, Fitter, Policy, Searcher, Task
 
 EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 

@@ -4,31 +4,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pegasus_jax.checks import choice
+from pegasus_jax.config import INITS
+
 EVALUATE, STEP = range(2)  # what a row does with the candidate whose cost and gradient it computes
 CURRENT, FRESH, START, COARSE = range(4)  # which parameters it visits: see `SearchTable.candidate`
-ACTIONS, CANDIDATES = ("evaluate", "step"), ("current", "fresh", "start", "coarse")
-INITS = ("previous", "better", "fresh")
 REFINED = 0.03  # the step size at the end of a refinement, as a fraction of the search's
-Column = Any  # an array of NumPy, in a program one of JAX
 
 
 class SearchTable(NamedTuple):
     """R rows, those of a search of N iterations in the order of their visits, and their factors in T searches.
 
-    The factors of a search are those of its own number, from 0; the last ones serve every later search.
+    The factors of a search are those of its number, from 0; the last serve every later one. NumPy's arrays or JAX's.
     """
 
-    iteration: Column  # [R] the iteration that the row belongs to, 0..N-1: N iterations can be cut anywhere
-    scenarios: Column  # [R] the iteration whose scenarios it is under: after the last step of a phase, the next one
-    action: Column  # [R] STEP goes on from the candidate, along its gradient; EVALUATE compares costs
+    iteration: Any  # [R] the iteration that the row belongs to, 0..N-1: N iterations can be cut anywhere
+    scenarios: Any  # [R] the iteration whose scenarios it is under: after the last step of a phase, the next one
+    action: Any  # [R] STEP goes on from the candidate, along its gradient; EVALUATE compares costs
     # [R] CURRENT: what the search has now. To evaluate one of the others takes it in place of CURRENT, evaluated in the
     # row before, if it costs no more: FRESH, a policy that knows nothing; START, what the search was given; COARSE,
     # what the refinement started from. The last two are also taken where a cost is NaN; FRESH is not.
-    candidate: Column
-    refine: Column  # [R] whether the objective is the refining one
-    cost_width: Column  # [T, R] factor of the cost's width
-    step_size: Column  # [T, R] factor of the optimizer's update
-    limit: Column  # [T, R] factor of the limit on a particle's gradient
+    candidate: Any
+    refine: Any  # [R] whether the objective is the refining one
+    cost_width: Any  # [T, R] factor of the cost's width
+    step_size: Any  # [T, R] factor of the optimizer's update
+    limit: Any  # [T, R] factor of the limit on a particle's gradient
 
 
 def search_table(
@@ -44,64 +44,41 @@ def search_table(
 ) -> SearchTable:
     """The table of searches of `steps` iterations each.
 
-    init: what a search starts from: the `previous` policy, a `fresh` one, or the `better` of both.
+    init: what a search starts from: the `previous` policy, a `fresh` one, or the `better` of both; else a ConfigError.
     refine: the iteration from which it refines the better of what it found and what it was given; None: never.
     cost_width_start: the cost's width at the start; it falls to 1, geometrically, by half of the coarse iterations.
     decay: the step size at the end of the coarse iterations, which falls from 1 as half a cosine.
     anneal_trials: searches over which width and step size fall once.
     warm_restart, warm_limit_factor: after those each search's step size falls from `warm_restart` to `decay` of it,
-    under `warm_limit_factor` times the limit; with warm_restart=0 both stay as they are. Raises ValueError for another
-    `init`.
+    under `warm_limit_factor` times the limit; with warm_restart=0 both stay as they are.
     """
-    if init not in INITS:
-        raise ValueError(f"init={init!r}; choose from {', '.join(INITS)}")
-    rows = np.array(_visits(steps, init, refine), np.int32).reshape(-1, 4)
-    iteration, scenarios, action, candidate = rows.T
-    number = np.arange(anneal_trials + 1 if anneal_trials > 1 else 1)[:, None]
-    i = number * steps + scenarios  # [T, R] counted over all searches
-    coarse = anneal_trials * steps if refine is None else refine
-    over = coarse / 2 if cost_width_start > 1 else 0
-    width = cost_width_start ** np.maximum(0, 1 - i / over) if over else np.ones(i.shape)
-    step_size = half_cosine(i / max(coarse, 1), 1, decay)
-    if refine is not None:
-        step_size = np.where(i < refine, step_size, half_cosine((i - refine) / max(steps - refine, 1), 1, REFINED))
-    limit = np.ones(i.shape)
-    if warm_restart:
-        annealed = number < anneal_trials
-        step_size = np.where(annealed, step_size, half_cosine(scenarios / steps, warm_restart, decay))
-        limit = np.where(annealed, limit, warm_limit_factor)
-    refines = np.zeros(len(rows), bool) if refine is None else scenarios >= refine
-    return SearchTable(iteration, scenarios, action, candidate, refines, width, step_size, limit)
-
-
-def _visits(steps: int, init: str, refine: int | None) -> list[tuple[int, int, int, int]]:
-    """The rows (iteration, scenarios, action, candidate) of a search."""
+    choice("init", init, INITS)
     rows = [(0, 0, EVALUATE, CURRENT), (0, 0, EVALUATE, FRESH)] if init == "better" else []
     for i in range(steps):
         rows += [(i, i, STEP, FRESH if init == "fresh" and i == 0 else CURRENT)]
         if refine is not None and i + 1 in (refine, steps):
             given = START if i + 1 == refine else COARSE
             rows += [(i, i + 1, EVALUATE, CURRENT), (i, i + 1, EVALUATE, given)]
-    return rows
+    iteration, scenarios, action, candidate = np.array(rows, np.int32).reshape(-1, 4).T
+    number = np.arange(anneal_trials + 1 if anneal_trials > 1 else 1)[:, None]
+    i = number * steps + scenarios  # [T, R] counted over all searches
+    coarse = anneal_trials * steps if refine is None else refine
+    width = cost_width_start ** np.maximum(0, 1 - i / (coarse / 2)) if coarse else np.ones(i.shape)
+    step_size = half_cosine(i / max(coarse, 1), decay)
+    if refine is not None:
+        step_size = np.where(i < refine, step_size, half_cosine((i - refine) / max(steps - refine, 1), REFINED))
+    annealed = (number < anneal_trials) | (warm_restart == 0)
+    step_size = np.where(annealed, step_size, warm_restart * half_cosine(scenarios / max(steps, 1), decay))
+    limit = np.where(annealed, np.ones(i.shape), warm_limit_factor)
+    refines = np.zeros(len(rows), bool) if refine is None else scenarios >= refine
+    return SearchTable(iteration, scenarios, action, candidate, refines, width, step_size, limit)
 
 
-def half_cosine(fraction: Any, top: float, decay: float) -> np.ndarray:
-    """A factor that falls from `top` to `decay` of it as the fraction goes from 0 to 1, and stays there."""
-    cosine = (1 + np.cos(np.pi * np.minimum(fraction, 1))) / 2
-    return top * ((1 - decay) * cosine + decay)
+def half_cosine(fraction: Any, decay: float) -> np.ndarray:
+    """A factor that falls from 1 to `decay` as the fraction goes from 0 to 1, and stays there."""
+    return (1 - decay) * (1 + np.cos(np.pi * np.minimum(fraction, 1))) / 2 + decay
 
 
 def first_rows(table: SearchTable) -> np.ndarray:
     """[N+1] the row with which each iteration begins, and the number of rows."""
     return np.searchsorted(table.iteration, np.arange(table.iteration.max(initial=-1) + 2)).astype(np.int32)
-
-
-def text(table: SearchTable, search: int = 0) -> str:
-    """The table of one search, from 0, as lines of words and numbers."""
-    head = "iteration scenarios action   candidate refine  width   step  limit"
-    factors = [column[min(search, len(column) - 1)] for column in table[-3:]]
-    lines = [
-        f"{i:9d} {s:9d} {ACTIONS[a]:8s} {CANDIDATES[c]:9s} {'yes' if r else 'no':6s} {w:6.3f} {size:6.3f} {limit:6.3g}"
-        for i, s, a, c, r, w, size, limit in zip(*table[:-3], *factors, strict=True)
-    ]
-    return "\n".join([head, *lines])

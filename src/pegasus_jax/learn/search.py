@@ -76,43 +76,31 @@ def search(
         (own, state), choose = learner, partial(jax.lax.select_n, now.candidate)
         visited = jax.tree.map(choose, own, own if fresh is None else fresh, state.start, state.start)
         value, gradient = jax.value_and_grad(problem.objective)(visited, posterior, scenarios, now)
-        learner, cost, skipped = after(now, learner, visited, value, gradient, problem.optimizer)
+        learner, cost, skipped = after(now, learner, visited, value, gradient, problem)
         i = now.iteration - first
         stepped = jnp.where(now.action == STEP, i, steps)
         norms = info.gradient_norm.at[stepped].set(optax.tree.norm(gradient), mode="drop")
         scenarios = sampler.redraw(key, following[row + k], scenarios, posterior)
         return learner, scenarios, SearchInfo(info.objective.at[i].set(cost), norms, info.skipped + skipped)
 
+    params, state = learner
+    optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
+    begins, new = jnp.asarray(first) == 0, state._replace(optimizer=optimizer, start=params)
+    learner = Learner(params, optax.tree.where(begins, new, state))
     scenarios, none = sampler.draw(key, jnp.asarray(first, jnp.int32), posterior), jnp.full(steps, jnp.nan)
-    loop = begun(learner, first, problem), scenarios, SearchInfo(none, none, jnp.int32(0))
-    learner, _, info = jax.lax.fori_loop(0, count, visit, loop)
+    learner, _, info = jax.lax.fori_loop(0, count, visit, (learner, scenarios, SearchInfo(none, none, jnp.int32(0))))
     return learner, info
 
 
 def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
     """The table [R] of the search after `earlier` others. Its numbers are data: no search compiles another program."""
-    searches = len(table.limit)
     # Where all are alike there is no choice to make: of searches vmapped over `earlier` each would have its own.
-    number = jnp.minimum(earlier, searches - 1) if searches > 1 else 0
+    number = jnp.minimum(earlier, most) if (most := len(table.limit) - 1) else 0
     return SearchTable(*map(jnp.asarray, table[:-3]), *(jnp.asarray(column)[number] for column in table[-3:]))
 
 
-def begun(learner: Learner, first: Array | int, problem: Problem) -> Learner:
-    """The learner as the search has it: new at its iteration 0, later as it is."""
-    params, state = learner
-    fresh = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
-    begins = jnp.asarray(first) == 0
-    optimizer, start = optax.tree.where(begins, (fresh, params), (state.optimizer, state.start))
-    return Learner(params, state._replace(optimizer=optimizer, start=start))
-
-
 def after(
-    row: SearchTable,
-    learner: Learner,
-    visited: Params,
-    value: Array,
-    gradient: Params,
-    optimizer: optax.GradientTransformation,
+    row: SearchTable, learner: Learner, visited: Params, value: Array, gradient: Params, problem: Problem
 ) -> tuple[Learner, Array, Array]:
     """What a row makes of the cost and gradient of what it visited -> (learner, cost of its parameters, skipped)."""
     (params, state), finite, steps_now = learner, is_finite(gradient), row.action == STEP
@@ -120,7 +108,8 @@ def after(
     older = ~(state.last < value)
     taken = jnp.stack([True, (value <= state.last) | state.no_improvement, older, older])[row.candidate] | steps_now
     params = optax.tree.where(taken, visited, params)
-    updates, moved = update_if(steps_now & finite, optimizer, gradient, Learner(params, state.optimizer), value=value)
+    now = Learner(params, state.optimizer)
+    updates, moved = update_if(steps_now & finite, problem.optimizer, gradient, now, value=value)
     start = optax.tree.where(row.candidate >= START, params, state.start)
     found = SearchState(moved, start, value, jnp.where(row.candidate == START, taken, state.no_improvement))
     params = optax.apply_updates(params, optax.tree.scale(row.step_size, updates))

@@ -8,12 +8,13 @@ import numpy as np
 
 from pegasus_jax import episode, interrupt
 from pegasus_jax.checks import RunError
+from pegasus_jax.episode import Episode
 from pegasus_jax.experiment import COLLECT, trial_key
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs.job import Job
 from pegasus_jax.runs.programs import gather, is_main_process
 from pegasus_jax.tasks import user_code
-from pegasus_jax.types import Episode, RunState, Task, Trajectory
+from pegasus_jax.types import RunState, Task, Trajectory
 
 
 def collected(job: Job, states: RunState, trial: int) -> list[Episode]:

@@ -13,12 +13,13 @@ from jax.sharding import Mesh
 from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.config import Config
+from pegasus_jax.experiment import Experiment
 from pegasus_jax.learn.data import grow
 from pegasus_jax.runs import restore, writers
 from pegasus_jax.runs.display import Display
 from pegasus_jax.runs.programs import Program, is_main_process
 from pegasus_jax.runs.writers import Writer
-from pegasus_jax.types import Experiment, RunState
+from pegasus_jax.types import RunState
 
 
 class Job(NamedTuple):

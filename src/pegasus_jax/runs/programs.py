@@ -17,9 +17,10 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding
 
 from pegasus_jax import interrupt, sharding
-from pegasus_jax.episode import trimmed
+from pegasus_jax.episode import Episode, trimmed
+from pegasus_jax.experiment import Experiment
 from pegasus_jax.runs.machine import processors
-from pegasus_jax.types import Episode, Experiment, Params, Trajectory
+from pegasus_jax.types import Params, Trajectory
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 

@@ -22,8 +22,9 @@ from pegasus_jax.assembly.experiments import compose, set_precision
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
 from pegasus_jax.episode import verdict
+from pegasus_jax.experiment import Experiment
 from pegasus_jax.runs import checkpoint, config_io, facts, store
-from pegasus_jax.types import Experiment, Learner, RunState, Task
+from pegasus_jax.types import Learner, RunState, Task
 
 Trial = int | str  # a number, or one of:
 LAST, BEST = "last", "best"

@@ -32,7 +32,8 @@ from pegasus_jax.runs.files import strict, write_json, write_whole
 from pegasus_jax.runs.machine import about
 
 if TYPE_CHECKING:  # JAX is imported where it is needed: a command names its folder before it waits for that
-    from pegasus_jax.types import Episode, Rollout, Task, Trajectory
+    from pegasus_jax.episode import Episode
+    from pegasus_jax.types import Rollout, Task, Trajectory
 
 FILES = ("config.yaml", "run.json", "trials.jsonl", ".lock")
 FOLDERS = ("episodes", "imagined", "checkpoints", "tensorboard", "plots")
@@ -161,7 +162,8 @@ def load_episode(run: Path, trial: int) -> Episode | None:
     found = _episode(run, trial)
     if found is None:
         return None
-    from pegasus_jax.types import Episode, Trajectory
+    from pegasus_jax.episode import Episode
+    from pegasus_jax.types import Trajectory
 
     rows = (found[name] for name in ("x", "u", "cost"))
     return Episode(Trajectory(*rows), str(found["ended"]))  # type: ignore[arg-type]

@@ -14,10 +14,12 @@ import jax
 
 from pegasus_jax.checks import RunError
 from pegasus_jax.config import Config
+from pegasus_jax.episode import Episode
+from pegasus_jax.experiment import Successor
 from pegasus_jax.runs import checkpoint, config_io, store
 from pegasus_jax.runs.programs import gather, is_main_process
 from pegasus_jax.runs.tensorboard import Board
-from pegasus_jax.types import Episode, RunState, Successor, Task
+from pegasus_jax.types import RunState, Task
 
 Row = dict[str, Any]  # a trial of one seed in numbers, as in trials.jsonl
 
