@@ -440,7 +440,7 @@ PIECES_THAT_ARE_WRONG = [
     ("policy", POLICY._replace(apply=lambda params, noise, x: x[0]), r"what policy\.apply returns .*\[K, U\]"),
     (
         "dynamics",
-        DYNAMICS._replace(apply=lambda *_: pg.Prediction(jnp.zeros(3), jnp.ones(D)), particles=None),
+        DYNAMICS._replace(apply=lambda *_: pg.Prediction(jnp.zeros(3), jnp.ones(D))),
         r"mean of what dynamics\.apply returns for K particles has shape \(5, 3\); expected \[K, D\] \(5, 2\)",
     ),
     ("cost", pg.costs.of_particles(pg.Cost(lambda x: x)), r"the cost of one state has shape \(2,\); expected \(\)"),

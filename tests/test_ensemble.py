@@ -11,6 +11,7 @@ from pegasus_jax.config import BNN, MLP
 from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.types import Batch, Dataset, Period, Prediction
+from pegasus_jax.vectorized import for_particles
 from probes import cart
 
 MEMBERS = 3
@@ -68,14 +69,14 @@ def test_particles_together_are_what_each_would_be_alone(pair, particles):
     keys = lambda: jax.random.split(jax.random.key(1), particles)  # noqa: E731
     x, u = (jax.random.normal(jax.random.key(i), (particles, width)) for i, width in enumerate((2, 1)))
     each = jax.vmap(many.apply, (None, 0, 0, 0))
-    together = many.particles(many.apply)
+    together = for_particles(many.apply)
     dealt, drawn = many.deal(keys(), posterior), jax.vmap(many.sample, (0, None))(keys(), posterior)
     assert np.argmax(dealt.chosen, 1).tolist() == [k % MEMBERS for k in range(particles)]
     for draws in (dealt, drawn):
         for one, other in zip(together(posterior, draws, x, u), each(posterior, draws, x, u), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-6)
-    still = many.particles(lambda posterior, draw, x, u: Prediction(0 * x, 0 * x))
-    assert not np.any(still(posterior, dealt, x, u).mean)
+    still = many._replace(apply=lambda posterior, draw, x, u: Prediction(0 * x, 0 * x))  # somebody's own
+    assert not np.any(for_particles(still.apply)(posterior, dealt, x, u).mean)
 
 
 def test_a_dealt_particles_draw_is_of_its_member():

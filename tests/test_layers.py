@@ -6,6 +6,7 @@ A new folder or top-level file: give it a layer in LAYERS.
 from __future__ import annotations
 
 import ast
+import re
 from pathlib import Path
 
 import pytest
@@ -15,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # Folders end in a dot. What one layer holds side by side does not import each other.
 LAYERS = {
     0: "types checks interrupt",
-    1: "config_models shapes sharding math.",
+    1: "config_models shapes sharding vectorized math.",
     2: "config models. imagine. episode",
     3: "presets policies. learn.",
     4: "tasks. pilco. experiment",
@@ -236,3 +237,83 @@ def test_a_large_function_is_found() -> None:
     assert too_large("def f(a, b, c, d, e, *, g, h, i, j): pass") == ["f: 1 lines, 9 parameters"]
     assert too_large("def f():\n" + "    x = 1\n" * LONGEST) == [f"f: {LONGEST + 1} lines, 0 parameters"]
     assert not too_large("def f():\n" + "    x = 1\n" * (LONGEST - 1))
+
+
+# Outside of the folders that choose pieces, values and types decide, never whose function something is or its name.
+
+CHOOSERS = ("assembly", "tasks")
+
+
+def decided_by_identity(source: str) -> list[str]:
+    """What decides by identity, by `hasattr`, or by a task's name: `is` is for None, True and False."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Compare):
+            sides = [node.left, *node.comparators]
+            of_constant = any(isinstance(side, ast.Constant) and side.value in (None, True, False) for side in sides)
+            identical = any(isinstance(operator, ast.Is | ast.IsNot) for operator in node.ops) and not of_constant
+            named = any(map(_task, sides)) and any(map(_names, sides))
+            if identical or named:
+                found.append(ast.unparse(node))
+        elif isinstance(node, ast.Call):
+            asks = isinstance(node.func, ast.Name) and node.func.id in ("hasattr", "getattr")
+            has = asks and (node.func.id == "hasattr" or len(node.args) == 3)
+            text = isinstance(node.func, ast.Attribute) and node.func.attr in ("startswith", "endswith")
+            if has or (text and _task(node.func.value)):
+                found.append(ast.unparse(node))
+        elif isinstance(node, ast.Match) and _task(node.subject):
+            found.append(f"match {ast.unparse(node.subject)}")
+    return found
+
+
+def _task(node: ast.AST) -> bool:
+    """Whether this is the name of a task: `config.task`, `task`, `task.name`, `run.task.name`."""
+    return bool(re.search(r"(^|\.)task(\.name)?$", ast.unparse(node)))
+
+
+def _names(node: ast.AST) -> bool:
+    """Whether this is a word in a program, a constant for one, or some of them."""
+    if isinstance(node, ast.Tuple | ast.List | ast.Set):
+        return any(map(_names, node.elts))
+    word = isinstance(node, ast.Constant) and isinstance(node.value, str)
+    constant = ast.unparse(node).rpartition(".")[2] if isinstance(node, ast.Name | ast.Attribute) else ""
+    return word or constant.isupper()
+
+
+def test_values_and_types_decide() -> None:
+    package = ROOT / "src" / "pegasus_jax"
+    files = [path for path in package.rglob("*.py") if path.relative_to(package).parts[0] not in CHOOSERS]
+    assert len(files) > 60
+    found = {str(path.relative_to(package)): decided_by_identity(path.read_text(encoding="utf-8")) for path in files}
+    assert {name: what for name, what in found.items() if what} == {}
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "f if given is not apply else g",
+        "if hasattr(plant, 'substeps'): pass",
+        "getattr(plant, 'substeps', None)",
+        "if config.task == 'gym': pass",
+        "if config.task in (tasks.GYM, MJCF): pass",
+        "if 'cartpole' != task.name: pass",
+        "run.task.name.startswith('swimmer_')",
+        "match config.task:\n    case _: pass",
+    ],
+)
+def test_what_decides_by_identity_is_found(source: str) -> None:
+    assert decided_by_identity(source)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "if x is None: pass",
+        "row.get('kept') is False",
+        "one.task == other.task",
+        "isinstance(x, Y)",
+        "getattr(x, name)",
+    ],
+)
+def test_what_decides_by_value_or_type_is_not(source: str) -> None:
+    assert not decided_by_identity(source)

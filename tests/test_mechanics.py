@@ -12,6 +12,7 @@ from pegasus_jax.models import _lagrangian_pallas as kernel
 from pegasus_jax.models import dropout
 from pegasus_jax.models.lagrangian import lagrangian
 from pegasus_jax.types import Array, Dataset
+from pegasus_jax.vectorized import for_particles
 
 # x in the order of a user's, with angles and rates anywhere; widths that are no powers of two are filled up.
 DOUBLE = dict(states=6, controls=1, angles=(4, 5), rates=(1, 2, 3), hidden=(32, 32), activation="silu")
@@ -75,7 +76,6 @@ def test_as_the_plain_form(case: dict, noise: dropout.Dropout, substeps: int, in
 def test_a_model_takes_it_where_there_is_one_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
     _, _, posterior, masks, x, u = pieces(RELU, dropout.none(), 1)
     model = lagrangian(**RELU, dropout=dropout.none(), dt=0.1, substeps=1)
-    assert model.particles is not None
     expected, calls = jax.vmap(model.apply, (None, 0, 0, 0))(posterior, masks, x, u), []
 
     def fused(*arguments: object, **mechanics: object) -> object:
@@ -86,12 +86,12 @@ def test_a_model_takes_it_where_there_is_one_gpu(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(kernel, "fused", fused)
     for there in (False, True):
         monkeypatch.setattr("pegasus_jax.models.lagrangian.pallas_allowed", lambda x, there=there: there)
-        got = model.particles(model.apply)(posterior, masks, x, u)
+        got = for_particles(model.apply)(posterior, masks, x, u)
         np.testing.assert_allclose(got.mean, expected.mean, rtol=2e-5, atol=2e-5)
         np.testing.assert_allclose(got.std, expected.std, rtol=1e-6)
         assert len(calls) == there
-    own = model.particles(lambda posterior, masks, x, u: u)  # a model that somebody changed
-    np.testing.assert_array_equal(own(posterior, masks, x, u), u)
+    own = model._replace(apply=lambda posterior, masks, x, u: u)  # a model that somebody changed
+    np.testing.assert_array_equal(for_particles(own.apply)(posterior, masks, x, u), u)
 
 
 @pytest.mark.parametrize(("case", "noise", "substeps"), CASES)

@@ -13,6 +13,7 @@ from pegasus_jax.imagine import matching
 from pegasus_jax.imagine.rollout import UNROLL, NoiseUse, limited, rollout
 from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.types import Dynamics, Period, Policy, Prediction, Scenarios
+from pegasus_jax.vectorized import Vectorized
 from probes import Linear, known, linear_policy, rig
 
 K, H, D = 7, 4, 3
@@ -168,9 +169,8 @@ def test_a_particle_holds_its_draws_for_the_whole_trajectory():
 
 def test_a_model_of_all_particles_at_once_is_taken_for_the_model_of_one():
     one = model(lambda posterior, draw, x, u: Prediction(draw, jnp.zeros(2)))
-    many = one._replace(
-        particles=lambda apply: lambda posterior, draws, x, u: Prediction(draws[::-1], jnp.zeros((3, 2)))
-    )
+    backwards = lambda posterior, draws, x, u: Prediction(draws[::-1], jnp.zeros((3, 2)))  # noqa: E731
+    many = one._replace(apply=Vectorized(one.apply, backwards))
     pieces = dict(policy=controller(lambda params, noise, x: noise[None]), match=matching.keep)
     steps = [np.diff(rollout(None, None, CONSTANT, dynamics=d, **pieces).x, axis=0) for d in (one, many)]
     np.testing.assert_allclose(steps[0], steps[1][:, ::-1], atol=1e-5)

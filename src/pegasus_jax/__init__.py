@@ -55,6 +55,7 @@ if TYPE_CHECKING:
         Task,
         Trajectory,
     )
+    from pegasus_jax.vectorized import Vectorized
 
 # Module -> its public names, in the order in which a reader needs them.
 _NAMES = {
@@ -88,6 +89,7 @@ _NAMES = {
     # the values that pass between them
     "types": "Task Cost Trajectory Dataset Batch Dynamics Prediction Dropout Policy Scenarios Period Rollout"
     " Learner Fitter Searcher RunState",
+    "vectorized": "Vectorized",
 }
 # Families of functions, each a module under a name of its own: `pegasus_jax.costs.mean`.
 _FAMILIES = {
@@ -135,6 +137,7 @@ __all__ = [
     "Task",
     "Trajectory",
     "TrialInfo",
+    "Vectorized",
     "angles",
     "blocks",
     "bnn",

@@ -5,8 +5,9 @@ import difflib
 import math
 import numbers
 from collections.abc import Iterable
-from types import UnionType
-from typing import Any, get_args, get_origin
+from contextlib import suppress
+from types import GenericAlias, UnionType
+from typing import Any, get_args
 
 # The greatest of each size that a setting may ask for: beyond is a slip of the keyboard, and no machine's work.
 SIZES = {
@@ -132,27 +133,30 @@ def typed(section: str, node: Any) -> None:
     """
     for f in dataclasses.fields(node):
         given = getattr(node, f.name)
-        value = _as(f.type, given)
-        if value is _WRONG:
+        try:
+            object.__setattr__(node, f.name, _as(f.type, given))
+        except TypeError:
             name = f"{section}.{f.name}" if section else f.name
-            raise ConfigError(f"{name}={shown(given)} is not {called(f.type)}; for example {name}={shown(f.default)}")
-        object.__setattr__(node, f.name, value)
-
-
-_WRONG = object()
+            expected = f"{called(f.type)}; for example {name}={shown(f.default)}"
+            raise ConfigError(f"{name}={shown(given)} is not {expected}") from None
 
 
 def _as(kind: Any, value: Any) -> Any:
-    """The value as this type, or _WRONG."""
-    if get_origin(kind) is UnionType or isinstance(kind, UnionType):
-        return next((found for part in get_args(kind) if (found := _as(part, value)) is not _WRONG), _WRONG)
-    if get_origin(kind) is tuple:
-        parts = [_as(get_args(kind)[0], part) for part in value] if isinstance(value, tuple | list) else [_WRONG]
-        return _WRONG if _WRONG in parts else tuple(parts)
-    if kind in (int, float):
-        number: Any = numbers.Integral if kind is int else numbers.Real
-        return kind(value) if isinstance(value, number) and not isinstance(value, bool) else _WRONG
-    return value if isinstance(value, kind) else _WRONG
+    """The value as this type. Raises TypeError where it is of another."""
+    if isinstance(kind, UnionType):
+        for part in get_args(kind):
+            with suppress(TypeError):
+                return _as(part, value)
+    elif isinstance(kind, GenericAlias):  # a tuple of any length
+        if isinstance(value, tuple | list):
+            return tuple(_as(get_args(kind)[0], part) for part in value)
+    elif kind in (int, float):
+        number: Any = {int: numbers.Integral, float: numbers.Real}[kind]
+        if isinstance(value, number) and not isinstance(value, bool):
+            return kind(value)
+    elif isinstance(value, kind):
+        return value
+    raise TypeError(f"{value!r} is not {called(kind)}")
 
 
 def called(kind: Any) -> str:

@@ -5,6 +5,7 @@ Values are checked when a config is made; a bad one raises `ConfigError`, which 
 
 import dataclasses
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -335,7 +336,12 @@ KINDS: dict[str, dict[str, Any]] = {
 
 def label(config: Config) -> str:
     """The task with what tells it from others of its name, as part of a folder's name."""
-    if config.task.startswith("swimmer_"):
-        return f"{config.task}-legs{config.legs}"
-    own = {GYM: config.env, MJCF: Path(config.mjcf or "").stem}.get(config.task)
+    legs = f"legs{config.legs}" if uses(config.task, "legs") else ""
+    own = legs or config.env or Path(config.mjcf or "").stem
     return f"{config.task}-{own}".replace("/", "-").replace(":", "-") if own else config.task
+
+
+def uses(task: str, name: str) -> bool:
+    """Whether a task uses the setting of this name: one of a plant's own is of use to some tasks only."""
+    (of,) = (f.metadata.get("of", ()) for f in dataclasses.fields(Config) if f.name == name)
+    return not of or any(fnmatch(task, pattern) for pattern in of)

@@ -13,7 +13,7 @@ from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 from typing import Any
 
-SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 PAUSE = 0.02  # seconds until a signal whose exception was lost, or could not be raised, is raised again
 LOADING = ("create_module", "exec_module")  # of a loader
@@ -43,7 +43,7 @@ def listen() -> None:
     _State.asked.clear()
     _State.others.clear()
     for number in SIGNALS:
-        if signal.getsignal(number) is not signal.SIG_IGN:  # as nohup leaves it
+        if signal.getsignal(number) != signal.SIG_IGN:  # as nohup leaves it
             signal.signal(number, _handle)
 
 
@@ -151,10 +151,7 @@ def _unraisable(otherwise: Callable[[Any], object], told: Any) -> None:
 def _repeat(number: int) -> None:
     time.sleep(PAUSE)
     _State.repeated = True
-    if hasattr(signal, "pthread_kill"):
-        signal.pthread_kill(threading.main_thread().ident, number)  # type: ignore[arg-type]
-    else:
-        signal.raise_signal(number)
+    signal.pthread_kill(threading.main_thread().ident, number)  # type: ignore[arg-type]
 
 
 def _handle(number: int, frame: FrameType | None) -> None:
@@ -165,7 +162,7 @@ def _handle(number: int, frame: FrameType | None) -> None:
         return
     _State.asked.append(number)
     other = _State.others.get(number)
-    if callable(other) and other is not signal.default_int_handler:
+    if callable(other) and other != signal.default_int_handler:
         try:
             other(number, frame)
         except Exception as error:

@@ -98,13 +98,12 @@ class Dynamics(NamedTuple):
     loss: Callable[[Params, Key, Batch, Any], Array]  # (params, key, batch, prepare(data)) -> scalar
     posterior: Callable[[Params, Dataset], Any]  # -> posterior, all that a rollout needs
     sample: Callable[[Key, Any], Params]  # (key, posterior) -> draw: one function, one particle's w^(k)
-    apply: Callable[[Any, Params, Array, Array], Prediction]  # (posterior, draw, x [D], u [U])
+    # (posterior, draw, x [D], u [U]); one that is `Vectorized` answers for K particles in a way of its own
+    apply: Callable[[Any, Params, Array, Array], Prediction]
     # (posterior, mean [F + U], cov of (encoded state, control)) -> gaussian.Image of the change; None: not known
     moments: Callable[[Any, Array, Array], Any] | None = None
     # (keys [K], posterior) -> draws [K, ...]: the functions of K particles together; None: `sample`, vmapped
     deal: Callable[[Key, Any], Params] | None = None
-    # apply -> the same of K particles at once, (posterior, draws [K, ...], x [K, D], u [K, U]); None: vmapped
-    particles: Callable[[Callable[..., Prediction]], Callable[..., Prediction]] | None = None
 
 
 class Policy(NamedTuple):

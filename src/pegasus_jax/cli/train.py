@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pegasus_jax.checks import ConfigError, whole
-from pegasus_jax.config import GYM, Config, Search, label
+from pegasus_jax.config import Config, Search, label
 
 OPTIONS = (
     "out",
@@ -74,8 +74,11 @@ def understood(words: Sequence[str]) -> Asked:
         if options.get(name) == "":
             raise ConfigError(f"{name}= names no folder; for example {name}=runs/demo")
     asked = _resumed(options, rest) if "resume" in options else _new(options, rest)
-    if len(asked.runs) > 1 and asked.config.task == GYM:
-        raise ConfigError(f"seeds={len(asked.runs)} is too many for task=gym, whose environment is one object; seeds=1")
+    if len(asked.runs) > 1 and asked.config.env is not None:
+        task = asked.config.task
+        raise ConfigError(
+            f"seeds={len(asked.runs)} is too many for task={task}, whose environment is one object; seeds=1"
+        )
     if options.get("final", "false") not in ("true", "false"):
         raise ConfigError(f"final={options['final']} is neither true nor false")
     return asked

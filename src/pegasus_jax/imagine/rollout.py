@@ -1,7 +1,6 @@
 """K imagined trajectories as a deterministic function of policy, posterior and scenarios. No keys here."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +8,7 @@ import jax.numpy as jnp
 
 from pegasus_jax.shapes import check_params, check_scenarios, check_shape
 from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenarios
+from pegasus_jax.vectorized import for_particles
 
 # Platform -> steps of the time loop compiled as one. Each round of a loop costs a GPU copies and launches
 # (docs/decisions/0013); a CPU would only compile longer.
@@ -45,8 +45,7 @@ def rollout(
     check_params("policy_params", policy_params)
     check_scenarios(scenarios)
     act = jax.vmap(policy.apply, (None, 0, 0))
-    many = dynamics.particles or partial(jax.vmap, in_axes=(None, 0, 0, 0))
-    predict = many(dynamics.apply)
+    predict = for_particles(dynamics.apply)
 
     def step(carry: tuple[Array, Array], draws: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple]:
         x, seeing = carry

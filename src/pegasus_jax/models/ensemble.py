@@ -1,12 +1,12 @@
 """Several models fitted side by side, of which each particle follows one (Lakshminarayanan 2017; PETS, Chua 2018)."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
+from pegasus_jax.vectorized import Vectorized
 
 
 class Dealt(NamedTuple):
@@ -60,21 +60,18 @@ def ensemble(member: Dynamics, members: int) -> Dynamics:
         mean, std = jax.vmap(member.apply, (0, None, None, None))(posterior, own, x, u)
         return Prediction(chosen @ mean, chosen @ std)
 
-    def particles(given: Callable[..., Prediction]) -> Callable[..., Prediction]:
-        def together(posterior: Params, draws: Any, x: Array, u: Array) -> Prediction:
-            if given is not apply or not isinstance(draws, Dealt):
-                return jax.vmap(given, (None, 0, 0, 0))(posterior, draws, x, u)
-            rounds = -(-len(x) // members)
-            filled = jnp.arange(rounds * members) % len(x)  # a last round that is not whole begins again, for nobody
+    def together(posterior: Params, draws: Any, x: Array, u: Array) -> Prediction:
+        if not isinstance(draws, Dealt):
+            return jax.vmap(apply, (None, 0, 0, 0))(posterior, draws, x, u)
+        rounds = -(-len(x) // members)
+        filled = jnp.arange(rounds * members) % len(x)  # a last round that is not whole begins again, for nobody
 
-            def split(rows: Array) -> Array:
-                whole = rows if len(filled) == len(x) else rows[filled]
-                return whole.reshape(rounds, members, *rows.shape[1:])
+        def split(rows: Array) -> Array:
+            whole = rows if len(filled) == len(x) else rows[filled]
+            return whole.reshape(rounds, members, *rows.shape[1:])
 
-            each = jax.vmap(jax.vmap(member.apply, (None, 0, 0, 0)), (0, 1, 1, 1), 1)
-            answers = each(posterior, *jax.tree.map(split, (draws.own, x, u)))
-            return jax.tree.map(lambda answer: answer.reshape(-1, *answer.shape[2:])[: len(x)], answers)
+        each = jax.vmap(jax.vmap(member.apply, (None, 0, 0, 0)), (0, 1, 1, 1), 1)
+        answers = each(posterior, *jax.tree.map(split, (draws.own, x, u)))
+        return jax.tree.map(lambda answer: answer.reshape(-1, *answer.shape[2:])[: len(x)], answers)
 
-        return together
-
-    return Dynamics(init, member.prepare, loss, posterior, sample, apply, deal=deal, particles=particles)
+    return Dynamics(init, member.prepare, loss, posterior, sample, Vectorized(apply, together), deal=deal)

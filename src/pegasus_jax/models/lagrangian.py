@@ -1,6 +1,5 @@
 """A mechanism whose energies are a Bayesian network: Lagrange's equations, integrated (after Lutter et al. 2019)."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +13,7 @@ from pegasus_jax.models._lagrangian_components import GREATEST_CHANGE, GREATEST_
 from pegasus_jax.models.networks import HEADS, Masks, noisy
 from pegasus_jax.sharding import pallas_allowed
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
+from pegasus_jax.vectorized import Vectorized
 
 # Of Student's t, the likelihood. A pendulum that spins fast turns by radians between two steps of the integration, and
 # no energies explain its next state: under a Gaussian, whose noise the head limits, a single such row would outweigh
@@ -151,23 +151,18 @@ def lagrangian(
 
     mechanics = dict(turning=turning, dt=dt, substeps=substeps, activation=activation)
 
-    def particles(apply: Callable[..., Prediction]) -> Callable[..., Prediction]:
-        each = jax.vmap(apply, (None, 0, 0, 0))
+    each = jax.vmap(predict, (None, 0, 0, 0))
 
-        def together(posterior: Posterior, masks: Masks, x: Array, u: Array) -> Prediction:
-            if apply is not predict or not pallas_allowed(x):
-                return each(posterior, masks, x, u)
-            from pegasus_jax.models import _lagrangian_pallas as kernel  # what it needs of JAX is for GPUs
+    def together(posterior: Posterior, masks: Masks, x: Array, u: Array) -> Prediction:
+        if not pallas_allowed(x):
+            return each(posterior, masks, x, u)
+        from pegasus_jax.models import _lagrangian_pallas as kernel  # what it needs of JAX is for GPUs
 
-            if not kernel.suits(hidden, n):
-                return each(posterior, masks, x, u)
-            order = np.concatenate([coordinates, moving])
-            change = kernel.fused(lambda *arguments: each(*arguments).mean, order, **mechanics)(posterior, masks, x, u)
-            return Prediction(
-                change, jnp.broadcast_to(head(posterior.params["raw_std"]) * posterior.units.change, x.shape)
-            )
-
-        return together
+        if not kernel.suits(hidden, n):
+            return each(posterior, masks, x, u)
+        order = np.concatenate([coordinates, moving])
+        change = kernel.fused(lambda *arguments: each(*arguments).mean, order, **mechanics)(posterior, masks, x, u)
+        return Prediction(change, jnp.broadcast_to(head(posterior.params["raw_std"]) * posterior.units.change, x.shape))
 
     def loss(params: Params, key: Key, batch: Batch, units: Units) -> Array:
         """Eq. 2 / N, but of Student's t, with fresh noise for every row; the constants have the weights' prior."""
@@ -185,8 +180,7 @@ def lagrangian(
         loss=loss,
         posterior=lambda params, data: Posterior(params, prepare(data)),
         sample=lambda key, posterior: network.sample(key, posterior.params["noise"]),
-        apply=predict,
-        particles=particles,
+        apply=Vectorized(predict, together),
     )
 
 

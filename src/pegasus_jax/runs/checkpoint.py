@@ -109,7 +109,7 @@ def _refused(path: Path) -> Iterator[None]:
     level, hooks = logging.root.manager.disable, (sys.unraisablehook, threading.excepthook)
 
     def of_main_thread(told: Any) -> None:
-        if threading.current_thread() is threading.main_thread():
+        if threading.current_thread() == threading.main_thread():
             hooks[0](told)
 
     logging.disable(logging.CRITICAL)

@@ -33,12 +33,12 @@ def collected(job: Job, states: RunState, trial: int) -> list[Episode]:
             known = gathered(job, states, trial, known)
     episodes = []
     for index, ran in enumerate(ran for ran in known if ran is not None):
-        now = costed(job, ran, trial)
+        finite = bool(np.isfinite(ran.trajectory.cost).all())
+        episodes.append(ran if finite else costed(job, ran, trial))
         # A damaged file, or a cost that its user mended.
-        if now is not ran and task.environment is None and is_main_process():
+        if not finite and task.environment is None and is_main_process():
             where = job.writer.where(index, trial)
             job.display.line(f"{where} has costs that are not finite; counted again from its observations")
-        episodes.append(now)
     return episodes
 
 
@@ -73,12 +73,10 @@ def check_finite(job: Job, trajectory: Trajectory, trial: int) -> None:
 
 
 def costed(job: Job, ran: Episode, trial: int) -> Episode:
-    """The episode with its costs, which are counted again where they are not finite: the user may have mended the cost.
+    """The episode with its costs counted again: the user may have mended the cost.
 
     Where they are not finite then either, the writer is told, with trial and observation.
     """
-    if np.isfinite(ran.trajectory.cost).all():
-        return ran
     x = np.asarray(ran.trajectory.x)
     cost = np.asarray(jax.vmap(job.experiment.task.cost.of_state)(jnp.asarray(x[1:])))
     for (t,) in np.argwhere(~np.isfinite(cost))[:1]:

@@ -4,7 +4,6 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from difflib import get_close_matches
-from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from pegasus_jax.checks import ConfigError, called, did_you_mean, shown
-from pegasus_jax.config import KINDS, TASKS, Config
+from pegasus_jax.config import KINDS, TASKS, Config, uses
 from pegasus_jax.presets import WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.removed import refuse, today
@@ -49,7 +48,7 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     task, begin = chosen.pop("task", None), chosen.pop("preset", None)
     if begin is None:
         task = task or Config.task
-        begin = own(task, override(Config(task=task), values(given)).legs if task in used_by()["legs"] else Config.legs)
+        begin = own(task, override(Config(task=task), values(given)).legs if uses(task, "legs") else Config.legs)
     config = preset(begin, **chosen)
     if task not in (None, config.task):
         raise ConfigError(f"preset={begin} is for task={config.task}, not task={task}; the nearest is preset={task}")
@@ -71,12 +70,8 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
 
 def used_by() -> dict[str, tuple[str, ...]]:
     """Setting -> the tasks that use it, of those settings that not every task uses."""
-    patterns = {f.name: f.metadata.get("of", ()) for f in dataclasses.fields(Config)}
-    return {
-        name: tuple(task for task in TASKS if any(fnmatch(task, pattern) for pattern in of))
-        for name, of in patterns.items()
-        if of
-    }
+    names = [f.name for f in dataclasses.fields(Config) if f.metadata.get("of")]
+    return {name: tuple(task for task in TASKS if uses(task, name)) for name in names}
 
 
 def _nearest_of(task: str, choices: Sequence[str]) -> str:

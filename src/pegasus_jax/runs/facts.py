@@ -96,7 +96,7 @@ def _text(value: Any) -> str:
 
 
 def _whole(value: Any, low: int, high: int) -> int:
-    if type(value) is not int or not low <= value <= high:
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         raise TypeError("whole numbers")
     return value
 

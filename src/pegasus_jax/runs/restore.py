@@ -173,9 +173,9 @@ def moved(run: Path, config: Config, mjcf: str | None = None) -> Config:
 
     That it is the same model is seen when it is read. Raises RunError, or ConfigError for a task without such a file.
     """
-    if mjcf is not None and config.task != tasks.MJCF:
+    if mjcf is not None and config.mjcf is None:
         raise ConfigError(f"mjcf={mjcf} is of no use here: the run is of task={config.task}")
-    if mjcf is None and (config.task != tasks.MJCF or config.mjcf is None or Path(config.mjcf).is_file()):
+    if mjcf is None and (config.mjcf is None or Path(config.mjcf).is_file()):
         return config
     file = Path(mjcf or Path(config.mjcf or "").name)
     if mjcf is None and not file.is_file():

@@ -10,7 +10,7 @@ import numpy as np
 
 from pegasus_jax import sharding
 from pegasus_jax.checks import SIZES, ConfigError
-from pegasus_jax.config import GYM, Config
+from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io, writers
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.job import first_states, opened
@@ -30,8 +30,9 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
     The seeds learn what `pegasus-train` would learn with them (runs/train.py); `curves` says what is kept. Raises
     ConfigError for a plant that cannot be vmapped.
     """
-    if config.task == GYM:
-        raise ConfigError("task=gym cannot be studied as one program: its environment is one object; use pegasus-train")
+    if config.env is not None:
+        one = "its environment is one object; use pegasus-train"
+        raise ConfigError(f"task={config.task} cannot be studied as one program: {one}")
     if not config.eval_episodes:
         raise ConfigError("eval_episodes=0 leaves a study nothing to compare; the nearest is 1")
     result: dict[str, Any] = {}

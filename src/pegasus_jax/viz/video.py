@@ -41,7 +41,7 @@ def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.LAS
     """Write RUN/play.mp4: `episodes` episodes that are not data, one after the other, in real time."""
     _, experiment, state = restore.ready(run, trial, mjcf)
     task = experiment.task
-    if not hasattr(task.plant, "glide"):
+    if task.plant is None:
         raise RunError(f"{run} learned {task.name}; only plants in JAX can be filmed")
     perform = jax.jit(partial(performance, task=task, policy=experiment.policy))
     path, writer = run / "play.mp4", None
