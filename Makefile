@@ -46,14 +46,14 @@ format: $(STAMP) ## format the code and fix what lint can fix
 	$(BIN)/ruff format $(CODE)
 
 bench: $(STAMP) ## measure speed
-	$(BIN)/python -m benchmarks.suite $(ARGS)
+	$(BIN)/python -m benchmarks.speed.suite $(ARGS)
 
 bench-compare: $(STAMP) ## measure speed again and fail if it is below .77 of the stored run's; quicker: ARGS="quick=true"
-	$(BIN)/python -m benchmarks.suite out=$(VENV)/speed.json $(ARGS)
-	$(BIN)/python -m benchmarks.compare $(VENV)/speed.json
+	$(BIN)/python -m benchmarks.speed.suite out=$(VENV)/speed.json $(ARGS)
+	$(BIN)/python -m benchmarks.speed.compare $(VENV)/speed.json
 
 figures: $(STAMP) ## run one of the paper's experiments: make figures FIGURE=crn
-	$(BIN)/pegasus-figures benchmarks/figures/$(FIGURE).toml out=benchmarks/results $(ARGS)
+	$(BIN)/python -m benchmarks.paper benchmarks/paper/$(FIGURE).toml out=benchmarks/results $(ARGS)
 
 docs: $(STAMP) ## draw the pictures of README.md and docs/ again
 	$(BIN)/python -m benchmarks.pictures $(ARGS)

@@ -1,1 +1,5 @@
-"""Measurements: speed (suite), learning (study; figures/ is for pegasus-figures), pictures for the documentation."""
+"""Measurements; benchmarks/README.md says what each command measures."""
+
+from pathlib import Path
+
+RESULTS = Path(__file__).parent / "results"

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from benchmarks import own_cost, study
+from benchmarks.paper import claims
+from benchmarks.paper.comparison import Result
+from benchmarks.paper.comparison import stored as read
 from pegasus_jax.presets import PRESETS
 from pegasus_jax.runs import config_io
-from pegasus_jax.studies import claims
-from pegasus_jax.studies.comparison import Result
-from pegasus_jax.studies.comparison import stored as read
-from pegasus_jax.studies.study import SOLVED
+from pegasus_jax.runs.study import SOLVED
 
 README_HEADER = ["task", "preset", "changed settings", "trial", "trials", "seeds"]
 README_HEADER += ["first trial at 90 %", "at 90 % in the last", "cost in the last"]

@@ -8,13 +8,12 @@ Run it after a study was added: it draws the figures' pictures and writes what i
 import os
 from pathlib import Path
 
-from benchmarks import readme_table
-from benchmarks.study import RESULTS
-from pegasus_jax.studies import claims
-from pegasus_jax.studies.comparison import draw, results
-from pegasus_jax.studies.figures import Figure, read
+from benchmarks import RESULTS, readme_table
+from benchmarks.paper import claims
+from benchmarks.paper.comparison import draw, results
+from benchmarks.paper.figures import Figure, read
 
-FIGURES = Path(__file__).parent / "figures"
+FIGURES = Path(__file__).parent / "paper"
 PAGE = Path(__file__).parents[1] / "docs" / "results.md"
 README = Path(__file__).parents[1] / "README.md"
 ORDER = ("cartpole", "crn", "clip", "rbf", "nn", "double")

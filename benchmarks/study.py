@@ -1,4 +1,4 @@
-"""One learning study of this project's records (pegasus_jax.study; pegasus-figures compares several).
+"""One learning study of this project's records (runs/study.py; `benchmarks.paper` compares several).
 
     python -m benchmarks.study NAME seeds=0-9 task=cartpole trials=15 [setting=value ...]
 
@@ -7,14 +7,12 @@ Writes benchmarks/results/NAME.json: per seed and trial the mean cost of 20 eval
 
 import shlex
 import sys
-from pathlib import Path
 
+from benchmarks import RESULTS
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import share_processors
-from pegasus_jax.studies.study import seed_list, study, table, write
-
-RESULTS = Path(__file__).parent / "results"
+from pegasus_jax.runs.study import seed_list, study, table, write
 
 
 def main(words: list[str], module: str = "benchmarks.study") -> None:

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import compare, readme_table, results_page, scaling, timing
-from benchmarks.study import RESULTS
-from benchmarks.workloads import SIZES, flop, products, workload
+from benchmarks import RESULTS, readme_table, results_page
+from benchmarks.speed import compare, scaling, timing
+from benchmarks.speed.workloads import SIZES, flop, products, workload
 from pegasus_jax.runs import config_io, machine
 
 TINY = {

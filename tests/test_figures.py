@@ -1,24 +1,27 @@
 """Figures: every file says something that can be run, a study is run once, and verdicts follow from the numbers."""
 
 import json
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import results_page
-from benchmarks.study import RESULTS
+from benchmarks import RESULTS, results_page
+from benchmarks.paper import claims, comparison
+from benchmarks.paper.figures import Claim, Figure, read
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import BNN, RBF, SSGP, Analytic, Config
-from pegasus_jax.studies import claims, comparison
-from pegasus_jax.studies.figures import Claim, Figure, read
-from pegasus_jax.studies.study import first_solved, rounded, seed_list, study
+from pegasus_jax.runs.study import first_solved, rounded, seed_list, study
 from pegasus_jax.viz.learning_curves import interval, iqm
 from probes import unchecked
 from test_train import call
 
+ROOT = Path(__file__).parents[1]
 FILES = {path.stem: path for path in sorted(results_page.FIGURES.glob("*.toml"))}
 FIGURES = {name: read(path) for name, path in FILES.items()}
 TINY = """
@@ -37,6 +40,14 @@ lower = "tight"
 than = "loose"
 trials = [1, 2]
 """
+
+
+def paper(*words: str, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
+    """`python -m benchmarks.paper` in a folder of a user's."""
+    command = [sys.executable, "-m", "benchmarks.paper", *words]
+    path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    env = {**os.environ, "PYTHONPATH": path, **env}
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, env=env)
 
 
 def write_study(folder: Path, stem: str, cost: np.ndarray, **changes: object) -> None:
@@ -141,11 +152,18 @@ def test_a_file_that_is_wrong_is_refused_in_one_line(old, new, message, tmp_path
 )
 def test_a_wrong_command_ends_in_one_line(words, message, tmp_path):
     (tmp_path / "mine.toml").write_text(TINY)
-    done = call("figures", *words, cwd=tmp_path)
+    done = paper(*words, cwd=tmp_path)
     assert done.returncode == 2
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
     assert [path.name for path in tmp_path.iterdir()] == ["mine.toml"]  # nothing was written
+
+
+def test_the_command_of_before_names_the_one_of_today(tmp_path):
+    done = call("figures", "mine.toml", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "python -m benchmarks.paper" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_an_environment_that_is_one_object_is_refused():
@@ -156,7 +174,7 @@ def test_an_environment_that_is_one_object_is_refused():
 @pytest.mark.slow
 def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
     (tmp_path / "mine.toml").write_text(TINY)
-    first = call("figures", "mine.toml", "out=there", "variants=loose", cwd=tmp_path)
+    first = paper("mine.toml", "out=there", "variants=loose", cwd=tmp_path)
     assert first.returncode == 0, first.stderr
     loose, out = (tmp_path / "there" / "mine-loose.json").read_bytes(), tmp_path / "there"
     assert sorted(path.name for path in out.iterdir()) == ["mine-loose.json", "mine.png"]
@@ -165,7 +183,7 @@ def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
     cut_short = json.loads(loose)
     del cut_short["about"]  # as a kill leaves it: written after each trial, without the last word
     (out / "mine-tight.json").write_text(json.dumps(cut_short))
-    second = call("figures", "mine.toml", "out=there", cwd=tmp_path)
+    second = paper("mine.toml", "out=there", cwd=tmp_path)
     assert second.returncode == 0, second.stderr
     assert (out / "mine-loose.json").read_bytes() == loose
     tight = json.loads((out / "mine-tight.json").read_text())
@@ -174,12 +192,12 @@ def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
     assert tight["config"]["search.grad_clip"] == 1e-3
     assert [row[0] for row in tight["calibration"]] == [None, None]  # nothing was known before the first trial
     assert all(row[1] > 0 for row in tight["calibration"])
-    assert "pegasus-figures mine.toml" in tight["about"]["command"]
+    assert "python -m benchmarks.paper mine.toml" in tight["about"]["command"]
     assert tight["episode_cost"][0][0] == json.loads(loose)["episode_cost"][0][0]  # the same random first episode
     assert "tight is better" in second.stdout
 
     both = {path: path.read_bytes() for path in out.glob("*.json")}
-    third = call("figures", "mine.toml", "out=there", "search.grad_clip=7", cwd=tmp_path)
+    third = paper("mine.toml", "out=there", "search.grad_clip=7", cwd=tmp_path)
     assert third.returncode == 0, third.stderr
     assert {path: path.read_bytes() for path in out.glob("*.json")} == both
     assert "mine-loose.json was made with search.grad_clip=1.0, not 7.0" in third.stderr
@@ -190,7 +208,7 @@ def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
 def test_the_cores_of_a_processor_share_the_seeds_of_a_study(tmp_path):
     """The command makes a device of each of two cores; here there is one. The numbers are those of one program."""
     figure = figure_of(tmp_path, TINY)
-    command = call("figures", "mine.toml", "out=there", "variants=loose", cwd=tmp_path, JAX_NUM_CPU_DEVICES="2")
+    command = paper("mine.toml", "out=there", "variants=loose", cwd=tmp_path, JAX_NUM_CPU_DEVICES="2")
     assert command.returncode == 0, command.stderr
     shared = json.loads((tmp_path / "there" / "mine-loose.json").read_text())
     assert len(shared["about"]["devices"]) == 2

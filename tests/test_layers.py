@@ -23,8 +23,7 @@ LAYERS = {
     5: "assembly.",
     6: "runs.",
     7: "viz.",
-    8: "studies.",
-    9: "cli. deploy __init__",
+    8: "cli. deploy __init__",
 }
 APPLICATION = 6  # the first layer that knows of files, terminals and people
 
@@ -184,7 +183,7 @@ ROLLOUT = "imagine.rollout (layer 2) imports"
         ("imagine/rollout.py", "from pegasus_jax.learn.search import a\n", f"{ROLLOUT} learn.search (layer 3)"),
         ("imagine/rollout.py", "from ..learn.search import a\n", f"{ROLLOUT} learn.search (layer 3)"),
         ("imagine/rollout.py", "def f():\n    import pegasus_jax.learn.search\n", f"rollout.py:2: {ROLLOUT} learn"),
-        ("imagine/rollout.py", "from pegasus_jax import gradient_search\n", f"{ROLLOUT} __init__ (layer 9)"),
+        ("imagine/rollout.py", "from pegasus_jax import gradient_search\n", f"{ROLLOUT} __init__ (layer 8)"),
         ("imagine/rollout.py", "if TYPE_CHECKING:\n    from ..models.bnn import b\n", f"{ROLLOUT} models.bnn"),
         (
             "math/angles.py",

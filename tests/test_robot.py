@@ -18,10 +18,9 @@ from pegasus_envs.gym_plant import env_spec
 from pegasus_jax import controller
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config
-from pegasus_jax.runs import config_io, store
+from pegasus_jax.runs import config_io, store, study
 from pegasus_jax.runs.restore import restored
 from pegasus_jax.runs.store import RunError
-from pegasus_jax.studies import study
 from pegasus_jax.viz.learning_curves import seeds_picture
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -16,9 +16,9 @@ from pegasus_jax.runs import checkpoint, store, writers
 from pegasus_jax.runs.display import Display
 from pegasus_jax.runs.job import Job, first_states
 from pegasus_jax.runs.programs import Program
+from pegasus_jax.runs.study import one_json, rounded
 from pegasus_jax.runs.train import learn
 from pegasus_jax.runs.writers import Writer
-from pegasus_jax.studies.study import one_json, rounded
 from pegasus_jax.types import RunState, Trajectory
 from probes import cart, same, tiny, unchecked
 

@@ -25,13 +25,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks import RESULTS
 from benchmarks.peers import of_mc_pilco, of_prob_mbrl, plain_torch
-from benchmarks.timing import compiled, in_turn, own_products, summary
-from benchmarks.workloads import SIZES, Workload, goal, workload
+from benchmarks.speed.timing import compiled, in_turn, own_products, summary
+from benchmarks.speed.workloads import SIZES, Workload, goal, workload
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
 
-RESULTS = Path(__file__).parents[1] / "results"
 STEPS, FIT_STEPS = 10, 100  # in one timed run
 LIMITS = {"objective": 1e-5, "gradient": 1e-3, "std": 1e-3}  # of what programs that do the same disagree by
 

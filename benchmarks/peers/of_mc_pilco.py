@@ -36,8 +36,8 @@ import torch
 from jax.flatten_util import ravel_pytree
 from torch import Tensor
 
-from benchmarks.suite import widened
-from benchmarks.workloads import EPISODES, Workload, goal, workload
+from benchmarks.speed.suite import widened
+from benchmarks.speed.workloads import EPISODES, Workload, goal, workload
 from pegasus_jax.pilco import kernels
 from pegasus_jax.pilco.gp import Posterior
 from pegasus_jax.pilco.kernels import inputs_of

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 
 from benchmarks.peers.plain_torch import Layers
-from benchmarks.workloads import Workload, goal
+from benchmarks.speed.workloads import Workload, goal
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching
 from pegasus_jax.imagine.objective import objective

@@ -28,7 +28,7 @@ from pegasus_jax.cli.sweep import PROGRAM
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about
-from pegasus_jax.studies.study import seed_list
+from pegasus_jax.runs.study import seed_list
 
 ROOT = Path(__file__).parents[2]
 ONE_CORE = {

@@ -131,14 +131,12 @@ def of_runs() -> list[Command]:
         " run:json=maybe run:trial=99 run:trial=-1 run:trial=best? run:trial=" + HUGE
     )
     readers = ("pegasus-eval", "pegasus-plot", "pegasus-play")
-    figures = words_of("none.toml . robots.py /dev/null robots.py:robots.py empty.toml wrong.toml list.toml seeds=0-3")
     sweeps = words_of(
         "task=none seed=0- seed=3-1 jobs=0:task=cartpole launcher=cloud launcher=slurm:slurm.x= trials=1,1 fit.steps="
         " out= seed=0-99999999999 trials=[1 model=bnn,gpp slurm.time=1 resume=run"
     )
     return [
         *(Command(name, tuple(word.split(":")), refused=True) for name in readers for word in words),
-        *(Command("pegasus-figures", tuple(word.split(":")), refused=True) for word in figures),
         *(Command("pegasus-sweep", ("launcher=print", *word.split(":")), refused=True) for word in sweeps),
         *(Command("pegasus-check", (*SMALL, word), refused=True) for word in ("trials=0", "serach.steps=1")),
     ]

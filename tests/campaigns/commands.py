@@ -21,9 +21,6 @@ FILES = {
     "leaving.py": "import sys\nsys.exit(7)\n",
     "raising.py": "raise OSError('no such board\\nsecond line')\n",
     "empty.xml": "",
-    "empty.toml": "",
-    "wrong.toml": 'title = 3\nvariants = "none"\n',
-    "list.toml": "[[variants]]\na = 1\n",
 }
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.in_c import in_c
+from benchmarks.plants.in_c import in_c
 from envs import references
 from envs.references import simulated
 from pegasus_envs import physics

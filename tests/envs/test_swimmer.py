@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks.feedback import GAINS, episodes
-from benchmarks.in_c import in_c, stroke
+from benchmarks.plants.feedback import GAINS, episodes
+from benchmarks.plants.in_c import in_c, stroke
 from pegasus_envs.plant import saturating, simulate
 from pegasus_envs.swimmer.plant import HIPS, LAG, hip_angles, swimmer
 from pegasus_envs.swimmer.rotations import angles_of, quaternion_of

@@ -31,8 +31,8 @@ pegasus-train task=gym algorithm=paper --help
 
 {settings}
 {others}
-PEGASUS_SETTINGS="fit.steps=5 search.steps=5" in the environment adds these words to every pegasus-train and
-pegasus-figures command, after those that are typed: of two values of a setting, the last one counts.
+PEGASUS_SETTINGS="fit.steps=5 search.steps=5" in the environment adds these words to every pegasus-train command,
+after those that are typed: of two values of a setting, the last one counts.
 
 examples
   pegasus-train task=cartpole
@@ -91,31 +91,6 @@ a graphics card a picture takes a tenth of a second or two, so a minute for the 
 examples
   pegasus-play runs/cartpole-seed0
   pegasus-play runs/cartpole-seed0 episodes=5 seed=1
-"""
-
-FIGURES = """\
-pegasus-figures FILE [out=runs/figures] [seeds=0-9] [variants=A,B] [setting=value ...]     compare learning curves
-
-FILE is TOML and says what varies, over which seeds and how many trials. Each variant is one vmapped program of all its
-seeds and leaves OUT/NAME-VARIANT.json, written after every trial; one that is there already is not run again. Then
-draws OUT/NAME.png (every seed thin, the interquartile mean thick with its 95 % bootstrap interval) and prints what came
-out, and what that says to the file's claims.
-
-  out=runs/figures      the folder of the studies; NAME is FILE without .toml
-  seeds=0-9             instead of the file's; or seeds=0,3,7
-  variants=A,B          run only these; all that are there are drawn
-  setting=value         in every variant, instead of the file's; pegasus-train --help lists settings
-
-a file
-  title = "How wide a policy?"
-  trials = 15
-  common = "task=cartpole algorithm=pegasus"
-  [variants]
-  narrow = "policy.hidden=[50,50]"
-  wide = "policy.hidden=[200,200]"
-
-With picture = "area", the area under each learning curve, a dot a seed. The paper's own are in benchmarks/figures/.
-On two CPU cores a variant of ten seeds takes most of an hour, on one GPU a minute or two.
 """
 
 WORDS = {"-h", "--help", "help"}

@@ -1,4 +1,4 @@
-"""The commands pegasus-train, -check, -eval, -plot, -play, -figures: `key=value` words in, an exit status out."""
+"""The commands pegasus-train, -check, -eval, -plot and -play: `key=value` words in, an exit status out."""
 
 import os
 import shlex
@@ -40,8 +40,9 @@ def play() -> None:
 
 
 def figures() -> None:
-    """Entry point of pegasus-figures."""
-    main(runs.figures, help.FIGURES, stopped="finished variants are kept, the same command goes on")
+    """Entry point of pegasus-figures, which left the package: its experiments and results are in benchmarks/."""
+    print("pegasus: pegasus-figures is now python -m benchmarks.paper, in a checkout of pegasus_jax", file=sys.stderr)
+    sys.exit(2)
 
 
 def main(
@@ -85,7 +86,7 @@ def _let_robots_go() -> None:
 def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: str) -> int:
     """The exit status of a command that nobody stopped."""
     try:
-        always = _always() if words and command in (cli_train.train, runs.figures) else ()
+        always = _always() if words and command is cli_train.train else ()
         words = _of_today([*words, *always])
         if not words or help.WORDS & {*words}:
             print(help.help_of(text, words), end="")

@@ -1,11 +1,8 @@
-"""The commands that look at runs: pegasus-eval, -plot, -play, and -figures, which makes its own."""
+"""The commands that look at runs: pegasus-eval, -plot, -play."""
 
 import json
-import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from pegasus_jax.checks import ConfigError, whole
 
@@ -43,30 +40,6 @@ def play(words: Sequence[str]) -> None:
     from pegasus_jax.viz.video import film
 
     print(film(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None))
-
-
-def figures(words: Sequence[str]) -> None:
-    from pegasus_jax.runs import config_io
-    from pegasus_jax.runs.programs import share_processors
-    from pegasus_jax.studies import claims, comparison
-    from pegasus_jax.studies.figures import read
-    from pegasus_jax.studies.study import seed_list
-
-    files = [word for word in words if "=" not in word]
-    if len(files) != 1:
-        raise ConfigError(f"name one file, not {len(files)}; for example benchmarks/figures/crn.toml")
-    options, changed = config_io.split([word for word in words if "=" in word], comparison.OPTIONS)
-    asked: dict[str, Any] = dict(seeds=options.get("seeds", ""), changes=[f"{k}={v}" for k, v in changed.items()])
-    only = [label for label in options.get("variants", "").split(",") if label]
-    figure, out = read(Path(files[0])), Path(options.get("out", "runs/figures"))
-    share_processors(len(seed_list(asked["seeds"] or figure.seeds)))
-    there = comparison.run(figure, out, only=only, command=shlex.join(["pegasus-figures", *words]), **asked)
-    for line in comparison.differences(figure, there, **asked):
-        print(line, file=sys.stderr)
-    print(claims.markdown(claims.variants_table(figure, out)))
-    if figure.claims:
-        print(f"\n{claims.markdown(claims.claims_table(figure, out))}")
-    print(comparison.draw(figure, there, out))
 
 
 def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False) -> tuple[Path, dict[str, str]]:

@@ -1,7 +1,7 @@
 """Alg. 1 trial by trial, for one seed or many at once: `learn` is its loop, `one_trial` and `improved` are its lines.
 
 Whatever is learned goes to a `Writer` (writers.py): `train` keeps a folder per seed that survives anything, a study
-(studies/study.py) one JSON of all seeds.
+(runs/study.py) one JSON of all seeds.
 """
 
 from contextlib import ExitStack

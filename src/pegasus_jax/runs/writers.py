@@ -1,7 +1,7 @@
 """Where the results of a job go: a `Writer` is a value, so the loop of Alg. 1 (train.py) knows of no files.
 
 `run_folders` keeps everything in a folder per seed (store.py), `nothing` keeps nothing; a study's writer, which makes
-one JSON of all seeds, is in studies/study.py.
+one JSON of all seeds, is in runs/study.py.
 """
 
 import sys

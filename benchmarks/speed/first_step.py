@@ -1,6 +1,6 @@
 """How long a user waits: seconds from the command `pegasus-train` to its first search iterations done.
 
-    python -m benchmarks.first_step [repeats=3] [setting=value ...]
+    python -m benchmarks.speed.first_step [repeats=3] [setting=value ...]
 
 With an empty folder for compiled programs and then with the one that the first run filled; each run is a process of its
 own, killed when the first chunk of its search is done. Writes benchmarks/results/first_step.json: the total, and what
@@ -47,7 +47,7 @@ def watched() -> None:
 
 def once(words: list[str], cache: str) -> dict[str, float]:
     """Seconds of one run of the command, with that folder of compiled programs."""
-    child = [sys.executable, "-c", "from benchmarks.first_step import watched; watched()"]
+    child = [sys.executable, "-c", "from benchmarks.speed.first_step import watched; watched()"]
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "XDG_CACHE_HOME": cache, STARTED: str(time.time())}
         done = subprocess.run(
@@ -58,7 +58,7 @@ def once(words: list[str], cache: str) -> dict[str, float]:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    from benchmarks.study import RESULTS  # here: what this module imports, the measured process waits for
+    from benchmarks import RESULTS  # here: what this module imports, the measured process waits for
     from pegasus_jax.runs import config_io
     from pegasus_jax.runs.machine import about, processors
 
@@ -72,7 +72,7 @@ def main(words: list[str]) -> None:
                 print(name, json.dumps({part: round(seconds, 2) for part, seconds in runs[-1].items()}), flush=True)
     result: dict[str, Any] = {name: min(runs, key=lambda run: run["total"]) for name, runs in rows.items()}
     result |= {"runs": rows, "cpus": processors()}
-    result["about"] = about(shlex.join(["python", "-m", "benchmarks.first_step", *words]))
+    result["about"] = about(shlex.join(["python", "-m", "benchmarks.speed.first_step", *words]))
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "first_step.json").write_text(json.dumps(result, indent=1) + "\n")
 

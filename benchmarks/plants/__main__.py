@@ -20,8 +20,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from benchmarks.in_c import Drive, held, in_c, stroke
-from benchmarks.study import RESULTS
+from benchmarks import RESULTS
+from benchmarks.plants.in_c import Drive, held, in_c, stroke
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.physics import Motion

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks.workloads import Workload, products
+from benchmarks.speed.workloads import Workload, products
 from pegasus_jax.runs.programs import FAST_RUN, compiler_options
 
 Program = Callable[[], Any]

@@ -1,6 +1,6 @@
 """What a step of the policy search costs for every model with every policy, on the cart-pole with 100 transitions.
 
-    python -m benchmarks.combinations [repeats=5] [setting=value ...]
+    python -m benchmarks.speed.combinations [repeats=5] [setting=value ...]
 
 K = 100 particles and H = 25 steps unless set otherwise; PILCO's analytic search takes one L-BFGS iteration, line search
 included. Prints milliseconds and multiples of a (100 x 200)(200 x 200) product timed in turn with each, and writes
@@ -15,10 +15,10 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from benchmarks.growth import experience
-from benchmarks.study import RESULTS
-from benchmarks.timing import compiled, in_turn, matmul
-from benchmarks.workloads import ALIKE
+from benchmarks import RESULTS
+from benchmarks.speed.growth import experience
+from benchmarks.speed.timing import compiled, in_turn, matmul
+from benchmarks.speed.workloads import ALIKE
 from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.presets import MODELS, POLICIES
 from pegasus_jax.runs import config_io
@@ -47,7 +47,7 @@ def step(words: dict[str, str], repeats: int) -> dict[str, float]:
 def main(words: list[str]) -> None:
     """The command line of this module; the file is written after every row."""
     options, dotted = config_io.split(words, ("repeats",))
-    result = {"rows": [], "about": about(shlex.join(["python", "-m", "benchmarks.combinations", *words]))}
+    result = {"rows": [], "about": about(shlex.join(["python", "-m", "benchmarks.speed.combinations", *words]))}
     RESULTS.mkdir(exist_ok=True)
     print(f"{'model':15s}{'policy':14s}{'search':10s}{'ms':>9s}{'products':>10s}{'compile s':>11s}")
     for chosen in COMBINATIONS:

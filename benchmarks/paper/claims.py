@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pegasus_jax.studies.comparison import Result, results, stored
-from pegasus_jax.studies.figures import Claim, Figure
-from pegasus_jax.studies.study import SOLVED, first_solved
+from benchmarks.paper.comparison import Result, results, stored
+from benchmarks.paper.figures import Claim, Figure
+from pegasus_jax.runs.study import SOLVED, first_solved
 from pegasus_jax.viz.learning_curves import interval, iqm
 
 MISSING = "not run yet"

@@ -1,8 +1,8 @@
 """Whole studies on GPUs: seconds of ten and a hundred seeds, of 1, 2 and 4 devices, of a hundred thousand particles.
 
-    python -m benchmarks.scaling seeds [counts=10,100] [setting=value ...]
-    python -m benchmarks.scaling devices [devices=1,2,4] [seeds=100] [trials=3] [setting=value ...]
-    python -m benchmarks.scaling particles [devices=1,4] [steps=5] [repeats=5] [setting=value ...]
+    python -m benchmarks.speed.scaling seeds [counts=10,100] [setting=value ...]
+    python -m benchmarks.speed.scaling devices [devices=1,2,4] [seeds=100] [trials=3] [setting=value ...]
+    python -m benchmarks.speed.scaling particles [devices=1,4] [steps=5] [repeats=5] [setting=value ...]
 
 `seeds` is the 15-trial cart-pole experiment on one device; `devices` shares seeds out over the mesh axis of that name
 and says how efficient that is, t1 / (n tn); `particles` times a search step with search.particles=100000 on so many
@@ -27,9 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from benchmarks.study import RESULTS
-from benchmarks.timing import summary
-from benchmarks.workloads import ALIKE, workload
+from benchmarks import RESULTS
+from benchmarks.speed.timing import summary
+from benchmarks.speed.workloads import ALIKE, workload
 from pegasus_jax import sharding
 from pegasus_jax.assembly.experiments import build, compose, set_precision
 from pegasus_jax.config import Config
@@ -185,7 +185,10 @@ def main(words: list[str]) -> None:
     options, dotted = config_io.split(rest, ("counts", "devices", "seeds", "steps", "repeats", "out"))
     path = Path(options.get("out", RESULTS)) / f"scaling-{part}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
-    result: dict[str, Any] = {"rows": {}, "about": about(shlex.join(["python", "-m", "benchmarks.scaling", *words]))}
+    result: dict[str, Any] = {
+        "rows": {},
+        "about": about(shlex.join(["python", "-m", "benchmarks.speed.scaling", *words])),
+    }
 
     def report(name: str, row: Row) -> None:
         result["rows"][name] = row

@@ -1,6 +1,6 @@
 """Speed here: a search step at the paper's sizes, and every other part of a trial, beside plain matrix products.
 
-    python -m benchmarks.suite [quick=true] [repeats=7] [out=FILE] [setting=value ...]
+    python -m benchmarks.speed.suite [quick=true] [repeats=7] [out=FILE] [setting=value ...]
 
 Prints one table and writes it, with versions and machine, to benchmarks/results/speed.json. Compare ratios within one
 run: machines are noisy. `of products` is the time of a search step over that of its own matrix products, each timed
@@ -20,14 +20,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.timing import clock, compiled, in_turn, matmul, own_products, summary
-from benchmarks.workloads import SIZES, Workload, flop, workload
+from benchmarks import RESULTS
+from benchmarks.speed.timing import clock, compiled, in_turn, matmul, own_products, summary
+from benchmarks.speed.workloads import SIZES, Workload, flop, workload
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about, processors
 
-RESULTS = Path(__file__).parent / "results"
 STEPS, FIT_STEPS, PRODUCTS = 10, 100, 500  # steps, and products, in one timed run
 Row = dict[str, float]
 Words = dict[str, str]
@@ -169,7 +169,7 @@ def main(words: list[str]) -> None:
     print(table(rows))
     print(f"peak memory of the process {peak / 1e9:.2f} GB")
     machine = {"cpus": processors()}
-    command = shlex.join(["python", "-m", "benchmarks.suite", *words])
+    command = shlex.join(["python", "-m", "benchmarks.speed.suite", *words])
     result = {"rows": rows, "peak_memory_bytes": peak, "machine": machine, "about": about(command)}
     out = Path(options.get("out", RESULTS / "speed.json"))
     out.parent.mkdir(exist_ok=True)

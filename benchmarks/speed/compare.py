@@ -1,6 +1,6 @@
 """Hold one run of the suite against a stored one, by ratios to the matrix products of the same process.
 
-    python -m benchmarks.compare NEW.json [STORED.json]
+    python -m benchmarks.speed.compare NEW.json [STORED.json]
 
 Fails when a row that both have has become slower by more than LIMIT, or when they have none in common. A quick run may
 be held against a full one. Both must have been made with as many CPUs.
@@ -11,7 +11,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-STORED = Path(__file__).parent / "results" / "speed.json"
+from benchmarks import RESULTS
+
+STORED = RESULTS / "speed.json"
 LIMIT = 1.3
 
 Rows = dict[str, dict[str, Any]]

@@ -10,18 +10,18 @@ from typing import Any
 import jax
 import numpy as np
 
+from benchmarks.paper.figures import Figure
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError, RunError, did_you_mean
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
-from pegasus_jax.studies.figures import Figure
-from pegasus_jax.studies.study import seed_list, study, write
+from pegasus_jax.runs.study import seed_list, study, write
 from pegasus_jax.viz.learning_curves import areas_picture, picture
 
 Result = dict[str, Any]  # a study's JSON
 
-OPTIONS = ("out", "seeds", "variants")  # of pegasus-figures; other words are settings
+OPTIONS = ("out", "seeds", "variants")  # of the command; other words are settings
 
 
 def configs(figure: Figure, changes: Sequence[str] = ()) -> dict[str, Config]:

@@ -1,6 +1,6 @@
 """How the cost of a model grows with the data: a BNN's does not, a Gaussian process's does.
 
-    python -m benchmarks.growth [rows=50,100,200,400,800] [repeats=3] [setting=value ...]
+    python -m benchmarks.speed.growth [rows=50,100,200,400,800] [repeats=3] [setting=value ...]
 
 For each method and number of rows n, on the cart-pole: one evaluation of the model's loss and its gradient (of all rows
 for a Gaussian process, of a minibatch for a BNN), conditioning on the data, drawing K = 100 functions, and an iteration
@@ -19,9 +19,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks.suite import RESULTS
-from benchmarks.timing import compiled, in_turn, matmul, summary
-from benchmarks.workloads import ALIKE
+from benchmarks import RESULTS
+from benchmarks.speed.timing import compiled, in_turn, matmul, summary
+from benchmarks.speed.workloads import ALIKE
 from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.runs import config_io
@@ -91,7 +91,7 @@ def main(words: list[str]) -> None:
     reference = summary(in_turn({"matmul": matmul(products)}, repeats)["matmul"], products)["min_ms"]
     print(f"matmul 100x200x200: {reference:.3f} ms")
     RESULTS.mkdir(exist_ok=True)
-    command = shlex.join(["python", "-m", "benchmarks.growth", *words])
+    command = shlex.join(["python", "-m", "benchmarks.speed.growth", *words])
     result = {"rows": table, "matmul_ms": reference, "about": about(command)}
     (RESULTS / "growth.json").write_text(json.dumps(result, indent=1) + "\n")
 

@@ -1,6 +1,6 @@
 """Can the swimmer's eight maneuvers be done at all? A feedback on the observation, at the control rate and limits.
 
-    python -m benchmarks.solvability [starts=16]
+    python -m benchmarks.plants.solvability [starts=16]
 
 Writes benchmarks/results/solvability.json and prints it beside the numbers of the measured design study that chose the
 swimmer's design (C MuJoCo, another hand-written law, its gains by CMA-ES, 16 starts).
@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.feedback import GAINS, ROLL, episodes
-from benchmarks.study import RESULTS
+from benchmarks import RESULTS
+from benchmarks.plants.feedback import GAINS, ROLL, episodes
 from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
@@ -82,7 +82,7 @@ def main(words: list[str]) -> None:
         measured = list(rows[legs][task].values())
         print(line(f"{task}, {legs} legs", measured if task == "corkscrew" else measured[:-1]))
         print(line("  design study", reported))
-    command = shlex.join(["python", "-m", "benchmarks.solvability", *words])
+    command = shlex.join(["python", "-m", "benchmarks.plants.solvability", *words])
     result = {"starts": starts, "rows": {f"{task}, {legs} legs": rows[legs][task] for legs, task in STUDY}}
     study = {f"{task}, {legs} legs": dict(zip(COLUMNS, values, strict=False)) for (legs, task), values in STUDY.items()}
     (RESULTS / "solvability.json").write_text(

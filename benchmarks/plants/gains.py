@@ -1,6 +1,6 @@
-"""A search for the gains of `benchmarks.feedback`: cross-entropy, from no knowledge but their signs and sizes.
+"""A search for the gains of `benchmarks.plants.feedback`: cross-entropy, from no knowledge but their signs and sizes.
 
-    python -m benchmarks.gains legs=2 task=knife_edge [generations=9] [seed=0]
+    python -m benchmarks.plants.gains legs=2 task=knife_edge [generations=9] [seed=0]
 
 Prints the best mean |e|^2 of each generation and the gains found. 32 candidates, 2 starts each; by default the depth
 changes get 30 generations, the others 9.
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.feedback import NAMES, ROLL, episodes
+from benchmarks.plants.feedback import NAMES, ROLL, episodes
 from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax.runs import config_io
 

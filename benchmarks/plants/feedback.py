@@ -27,7 +27,7 @@ GAINS = {
     (6, "corkscrew"): [0.509, 0.106, 0.02, 0.427, 0.006, 0.327, 0.141, 0.677, 0.494, 0.217, 0.0],
     (6, "depth_change"): [0.785, 0.283, 0.049, 1.411, 0.078, 0.29, 0.234, 0.332, 0.494, 0.348, 1.855],
 }
-"""by a cross-entropy search such as `benchmarks.gains`"""
+"""by a cross-entropy search such as `benchmarks.plants.gains`"""
 
 
 def feedback(gains: Array, x: Array, task: str, legs: int, depth: float, rate: float = -2.0 * np.pi / 3.0) -> Array:

@@ -1,6 +1,6 @@
 """From a newcomer's command to a controller that works: wall-clock time of `pegasus-train` with its defaults.
 
-    python -m benchmarks.newcomer [task=cartpole] [seeds=0-9] [minutes=4] [jobs=1]
+    python -m benchmarks.speed.newcomer [task=cartpole] [seeds=0-9] [minutes=4] [jobs=1]
 
 Starts `pegasus-train` once a seed, `jobs` at a time and each in an empty folder with an empty compilation cache, and
 stops it as soon as a trial's evaluation succeeds in at least 90 % of its episodes, or after `minutes`. Writes
@@ -20,11 +20,12 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from benchmarks.study import RESULTS, seed_list
+from benchmarks import RESULTS
 from pegasus_jax.cli.sweep import PROGRAM
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.store import trials
+from pegasus_jax.runs.study import seed_list
 
 Slots = SimpleQueue[set[int] | None]
 
@@ -72,7 +73,7 @@ def main(words: list[str]) -> None:
         results = list(pool.map(lambda seed: newcomer(seed, train, limit, slots), seeds))
     solved = [result["seconds"] for result in results if result["seconds"] is not None]
     print(f"{len(solved)} of {len(results)} solved within {limit:.0f} s, the slowest in {max(solved, default=0)} s")
-    command = shlex.join(["python", "-m", "benchmarks.newcomer", *words])
+    command = shlex.join(["python", "-m", "benchmarks.speed.newcomer", *words])
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "newcomer.json").write_text(json.dumps({"runs": results, "about": about(command)}) + "\n")
 

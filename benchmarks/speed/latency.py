@@ -1,6 +1,6 @@
 """How soon a robot gets its next control: inside an episode, and from what a run leaves for deployment.
 
-    python -m benchmarks.latency [setting=value ...]
+    python -m benchmarks.speed.latency [setting=value ...]
 
 Learns for two short trials on an environment that answers at once and notes when it is called. Writes
 benchmarks/results/latency.json: microseconds (median, 99th percentile, most) between the return of the environment's
@@ -19,7 +19,7 @@ import gymnasium
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.study import RESULTS
+from benchmarks import RESULTS
 from pegasus_jax import controller, tasks
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
@@ -79,7 +79,7 @@ def main(words: list[str]) -> None:
             control(np.zeros(4))
             calls.append(time.perf_counter() - began)
     row = {"between steps": microseconds(gaps), "controller": microseconds(calls)}
-    command = shlex.join(["python", "-m", "benchmarks.latency", *words])
+    command = shlex.join(["python", "-m", "benchmarks.speed.latency", *words])
     (RESULTS / "latency.json").write_text(json.dumps({"rows": row, "about": about(command)}, indent=1) + "\n")
     print(json.dumps(row))
 

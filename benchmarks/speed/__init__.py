@@ -1,0 +1,1 @@
+"""How fast: search steps, parts of a trial, first results, many seeds and devices."""

@@ -1,1 +1,0 @@
-"""Experiments over many seeds: what the paper's figures and our tables are made of."""
