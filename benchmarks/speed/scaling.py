@@ -31,74 +31,45 @@ from benchmarks import RESULTS
 from benchmarks.speed.timing import summary
 from benchmarks.speed.workloads import ALIKE, workload
 from pegasus_jax import sharding
-from pegasus_jax.assembly.experiments import build, compose, set_precision
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.config import Config
-from pegasus_jax.experiment import EVALUATE, Experiment, trial_key
-from pegasus_jax.runs import config_io
+from pegasus_jax.runs import config_io, writers
+from pegasus_jax.runs.job import first_states, opened
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import FAST_RUN, Jitted, compiler_options, over_seeds, shard
-from pegasus_jax.types import Array, RunState
+from pegasus_jax.runs.train import learn
+from pegasus_jax.types import RunState
 
 Row = dict[str, Any]
 Report = Callable[[str, Row], None]  # (the row's name, the row) -> printed and on disk
 COLLECTIVE = re.compile(
     r" = [^=]*? (?:all-reduce|all-gather|all-to-all|reduce-scatter|collective-permute)(?:-start)?\("
 )
-EPISODES = 20  # of evaluation
-
-
-def spread(function: Callable[..., Any], axes: tuple[int | None, ...], seeds: int, over: Mesh | None) -> Jitted:
-    """The function over seeds, and these over a mesh, as `pegasus-train seeds= mesh=` compiles it."""
-    layout = {} if over is None else {"out_shardings": sharding.over_seeds(over)}
-    how = compiler_options(FAST_RUN)
-    return Jitted(over_seeds(function, axes, seeds=seeds, over=over), compiler_options=how, **layout)
-
-
-def parts_of(experiment: Experiment) -> dict[str, Callable[[RunState], Any]]:
-    """The parts of a trial, each (state) -> (state, what it reports)."""
-
-    def collect(state: RunState) -> tuple[RunState, Array]:
-        trajectory = experiment.collect(state)
-        return experiment.add_episode(state, trajectory), trajectory.cost
-
-    def evaluate(state: RunState) -> tuple[RunState, Array]:
-        keys = jax.random.split(trial_key(state.key, state.trial, EVALUATE), EPISODES)
-        return state, jax.vmap(experiment.episode, (0, None, None))(keys, state.policy.params, False).cost
-
-    return {"collect": collect, "fit": experiment.fit, "search": experiment.search, "evaluate": evaluate}
 
 
 def study(config: Config, seeds: int, over: Mesh | None, report: Callable[[Row], None]) -> Row:
-    """Seconds of every trial of a study, and of its parts; reported after each trial."""
-    set_precision(config)
-    experiment = build(config, over)
-    prepared = partial(spread, axes=(0,), seeds=seeds, over=over)
-    parts = {name: prepared(function) for name, function in parts_of(experiment).items()}
-    states = prepared(experiment.init)(on_devices(jax.vmap(jax.random.key)(jnp.arange(seeds)), over))
+    """Seconds of every trial of a study, and of its parts, as `pegasus-train` learns it; reported after each trial."""
     devices = 1 if over is None else over.devices.size
     row: Row = {"seeds": seeds, "devices": devices, "device": jax.devices()[0].device_kind, "trial_s": []}
-    spent: dict[str, list[float]] = {name: [] for name in parts}
-    for _ in range(config.trials):
-        costs = None
-        for name, jitted in parts.items():
-            compiled, began = jitted.seconds, time.perf_counter()
-            states, costs = jitted(states)
-            spent[name].append(time.perf_counter() - began - (jitted.seconds - compiled))
-        row["trial_s"].append(sum(times[-1] for times in spent.values()))
-        row["run_s"] = sum(row["trial_s"])
-        row["compile_s"] = sum(jitted.seconds for jitted in parts.values())
-        row["parts_s"] = {name: statistics.median(times) for name, times in spent.items()}
-        row["mean_cost"] = float(np.mean(np.asarray(costs)))
-        if "collectives" not in row:
-            row["collectives"] = {name: collectives(jitted) for name, jitted in parts.items()}
-        row["peak_gb"] = peaks(devices)
-        report(row)
+    spent: list[dict[str, float]] = []
+    with opened(config, range(seeds), over) as job:
+
+        def trial(number: int, states: RunState, rows: list[Row]) -> None:
+            spent.append(rows[0]["seconds"])
+            row["compile_s"] = sum(trial["compile"] for trial in spent)
+            row["trial_s"] = [sum(trial.values()) - trial["compile"] for trial in spent]
+            row["run_s"] = sum(row["trial_s"])
+            row["parts_s"] = {
+                name: statistics.median(trial[name] for trial in spent) for name in spent[0] if name != "compile"
+            }
+            row["mean_cost"] = statistics.mean(one["mean_cost"] for one in rows)
+            compiled = {name: part for name, part in job.program.parts.items() if part.compiled is not None}
+            row["collectives"] = {name: collectives(part) for name, part in compiled.items()}
+            row["peak_gb"] = peaks(devices)
+            report(row)
+
+        learn(job._replace(writer=writers.nothing(seeds)._replace(trial=trial)), first_states(job))
     return row
-
-
-def on_devices(tree: Any, over: Mesh | None) -> Any:
-    """The tree [S, ...] with its seeds laid out over the mesh."""
-    return tree if over is None else shard(tree, sharding.over_seeds(over))
 
 
 def collectives(jitted: Jitted) -> int:
@@ -144,7 +115,9 @@ def of_particles(options: dict[str, str], words: dict[str, str], report: Report)
     for count in numbers(options, "devices", "1,4"):
         over = sharding.mesh(1, count)
         experiment = compose(config, small.task, mesh=over)
-        search = spread(partial(experiment.search, steps=steps), (0, None), 1, over)
+        layout = {} if over is None else {"out_shardings": sharding.over_seeds(over)}
+        function = over_seeds(partial(experiment.search, steps=steps), (0, None), seeds=1, over=over)
+        search = Jitted(function, compiler_options=compiler_options(FAST_RUN), **layout)
         arguments: tuple[Any, ...] = (states, jnp.int32(1))  # not 0, which would also weigh a fresh policy
         if over is not None:
             arguments = shard(states, sharding.over_seeds(over)), shard(jnp.int32(1), sharding.shared(over))
