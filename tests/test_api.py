@@ -491,18 +491,31 @@ def test_a_number_is_no_cost() -> None:
 APPLICATIONS = {"gymnasium", "imageio", "matplotlib", "mujoco", "orbax", "scipy", "tensorboardX"}
 
 
+EVERY = "[getattr(pg, n) for n in pg.__all__ if n.lower() != 'controller']"
+
+
 @pytest.mark.parametrize(
     ("code", "absent", "present"),
     [
         ("", APPLICATIONS | {"jax", "numpy", "omegaconf", "rich"}, set()),
         ("pg.rollout", APPLICATIONS | {"omegaconf", "rich"}, {"jax"}),
-        ("[getattr(pg, n) for n in pg.__all__ if n.lower() != 'controller']", APPLICATIONS | {"omegaconf"}, {"flax"}),
+        (EVERY, APPLICATIONS | {"omegaconf"}, {"flax"}),
         ("pg.tasks.make('cartpole')", APPLICATIONS - {"gymnasium", "mujoco", "scipy"} | {"omegaconf"}, {"mujoco"}),
+        ("import pegasus_jax.viz.run_plots", APPLICATIONS - {"matplotlib"} | {"rich"}, {"matplotlib"}),
+        ("import pegasus_jax.runs.checkpoint", APPLICATIONS | {"rich"}, {"jax"}),
+        ("import pegasus_jax.runs.train", APPLICATIONS - {"tensorboardX"}, {"rich", "omegaconf"}),
     ],
 )
 def test_a_name_imports_what_it_needs_and_no_more(code: str, absent: set[str], present: set[str]) -> None:
-    assert not absent & loaded(f"import pegasus_jax as pg\n{code}")
-    assert present <= loaded(f"import pegasus_jax as pg\n{code}")
+    found = loaded(f"import pegasus_jax as pg\n{code}")
+    assert not absent & found
+    assert present <= found
+
+
+def test_every_name_needs_five_packages_and_what_they_import() -> None:
+    needed = loaded("import jax, flax, optax, chex, numpy")
+    found = loaded(f"import pegasus_jax as pg\n{EVERY}")
+    assert found - needed - sys.stdlib_module_names == {"pegasus_jax"}
 
 
 def test_a_refused_command_waits_for_no_array_library() -> None:
