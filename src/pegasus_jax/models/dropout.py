@@ -15,7 +15,6 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jax.lax import erf_inv
 from jax.scipy.special import erf, log_ndtr
 
 from pegasus_jax.types import Dropout
@@ -25,6 +24,9 @@ from pegasus_jax.types import Dropout
 # agree.
 _LOG_UNIFORM_CONSTANT = 0.5 * (0.5772156649015329 + math.log(2.0))
 _SQRT_2 = math.sqrt(2.0)
+# erf_inv(x) / x as a polynomial in sqrt(2 - log(1 - x^2)), highest power first: minimax over 1 - |x| > 5e-6. With
+# jax.lax.erf_inv, which is exact to the last bit, a fit step takes 1.07 of the time.
+_ERF_INV = (-0.0097237873, 0.154730024, -0.980937942, 3.08985322, -4.82486895, 4.09892242, -0.873961558)
 
 __all__ = ["binary", "concrete", "gaussian", "log_normal", "none", "sparse"]
 
@@ -183,8 +185,8 @@ def log_normal(
 
     def mask(params, noise):
         mu, sigma, alpha, beta = normal(params)
-        start, end = erf(alpha / _SQRT_2), erf(beta / _SQRT_2)  # 2 Phi - 1, so the quantile is one erf_inv on (-1, 1)
-        log_z = mu + (_SQRT_2 * sigma) * erf_inv(start + noise * (end - start))
+        start, end = erf(alpha / _SQRT_2), erf(beta / _SQRT_2)  # 2 Phi - 1, so the quantile is one _erf_inv on (-1, 1)
+        log_z = mu + (_SQRT_2 * sigma) * _erf_inv(start + noise * (end - start))
         return jnp.exp(jnp.clip(log_z, low, high))  # the clip only undoes rounding
 
     def kl(params):
@@ -236,6 +238,15 @@ def _uniform(key, width):
 
 def _logit(u):
     return jnp.log(u) - jnp.log1p(-u)
+
+
+def _erf_inv(x):
+    """The y with erf(y) = x, to 4e-5 of it, for |x| < 1 - 5e-6: noise of 16 bits comes no nearer to 1."""
+    s = jnp.sqrt(2.0 - jnp.log((1.0 - x) * (1.0 + x)))
+    ratio = jnp.full_like(s, _ERF_INV[0])
+    for coefficient in _ERF_INV[1:]:
+        ratio = ratio * s + coefficient
+    return ratio * x
 
 
 def _between(raw, low, high):
