@@ -110,7 +110,7 @@ J = partial(pg.objective, **PIECES, cost=pg.costs.of_particles(TASK.cost))
 # An example of every exported function; what it returns must be finite
 
 EXAMPLES: dict[str, Callable[[], Any]] = {}
-IMPURE = {"build", "compose", "controller", "tasks.make", "tasks.of_config", "angles.feature_names"}
+IMPURE = {"build", "compose", "controller", "export", "tasks.make", "tasks.of_config", "angles.feature_names"}
 
 
 def example(*names: str) -> Callable[[Callable[[], Any]], Callable[[], Any]]:
@@ -158,7 +158,7 @@ def _() -> Any:
     return state.data, info.evaluation, state.policy.params
 
 
-@example("controller")
+@example("controller", "export")
 def _() -> Any:
     raise AssertionError("needs a run's folder: see below")
 
@@ -167,6 +167,7 @@ def test_a_controller_of_a_run(tmp_path: Any) -> None:
     control = pg.controller(a_run(tmp_path / "run", trials=1), trial="last")
     assert isinstance(control, pg.Controller)
     assert control(np.zeros(4)).shape == (1,)
+    assert pg.export(tmp_path / "run", out=tmp_path / "act.py").exists()
 
 
 @example("dynamics_of", "bnn", "ensemble", "lagrangian", "gp", "ssgp")
@@ -342,7 +343,7 @@ PUBLIC = public()
 FUNCTIONS = {name: value for name, value in PUBLIC.items() if inspect.isfunction(inspect.unwrap(value))}
 
 
-@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - {"controller"}))
+@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - {"controller", "export"}))
 def test_an_exported_function_is_called_with_exported_names(name: str) -> None:
     assert name in EXAMPLES, f"{name} is exported and has no example here"
     found = EXAMPLES[name]() if name in IMPURE else _jitted(EXAMPLES[name])

@@ -22,7 +22,7 @@ LAYERS = {
     4: "tasks. pilco. experiment",
     5: "assembly.",
     6: "runs.",
-    7: "viz.",
+    7: "viz. exports.",
     8: "cli. deploy __init__",
 }
 APPLICATION = 6  # the first layer that knows of files, terminals and people

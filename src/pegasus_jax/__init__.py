@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from pegasus_jax.config import Config
     from pegasus_jax.episode import Episode
     from pegasus_jax.experiment import Experiment, Successor, TrialInfo, run, trial
+    from pegasus_jax.exports.write import export
     from pegasus_jax.imagine import costs, matching
     from pegasus_jax.imagine.objective import objective
     from pegasus_jax.imagine.rollout import NoiseUse, rollout
@@ -68,6 +69,7 @@ _NAMES = {
     "checks": "ConfigError RunError",
     "runs.controller": "controller Controller",
     "episode": "Episode",
+    "exports.write": "export",
     # the method, function by function
     "imagine.scenarios": "blocks Blocks draw sampler Sampler",
     "imagine.rollout": "rollout NoiseUse",
@@ -151,6 +153,7 @@ __all__ = [
     "dropouts",
     "dynamics_of",
     "ensemble",
+    "export",
     "fit",
     "gaussian",
     "gp",

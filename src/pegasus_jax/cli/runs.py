@@ -8,13 +8,13 @@ from pegasus_jax.checks import ConfigError, whole
 
 
 def evaluate(words: Sequence[str]) -> None:
-    run, rest = _run_and(words, {"episodes": "20", "seed": "0", "json": "false", "trial": "last", "mjcf": ""})
+    run, rest = run_and(words, {"episodes": "20", "seed": "0", "json": "false", "trial": "last", "mjcf": ""})
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     if rest["json"] not in ("true", "false"):
         raise ConfigError(f"json={rest['json']} is neither true nor false")
     from pegasus_jax.runs.evaluation import evaluate_run
 
-    result = evaluate_run(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None)
+    result = evaluate_run(run, episodes, seed, trial_of(rest["trial"]), rest["mjcf"] or None)
     if rest["json"] == "true":
         print(json.dumps(result))
     else:
@@ -22,7 +22,7 @@ def evaluate(words: Sequence[str]) -> None:
 
 
 def plot(words: Sequence[str]) -> None:
-    run, _ = _run_and(words, {}, many=True)
+    run, _ = run_and(words, {}, many=True)
     from pegasus_jax.runs import store
     from pegasus_jax.viz.learning_curves import seeds_picture
     from pegasus_jax.viz.run_plots import run_pictures
@@ -35,14 +35,14 @@ def plot(words: Sequence[str]) -> None:
 
 
 def play(words: Sequence[str]) -> None:
-    run, rest = _run_and(words, {"episodes": "1", "seed": "0", "trial": "last", "mjcf": ""})
+    run, rest = run_and(words, {"episodes": "1", "seed": "0", "trial": "last", "mjcf": ""})
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     from pegasus_jax.viz.video import film
 
-    print(film(run, episodes, seed, _trial(rest["trial"]), rest["mjcf"] or None))
+    print(film(run, episodes, seed, trial_of(rest["trial"]), rest["mjcf"] or None))
 
 
-def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False) -> tuple[Path, dict[str, str]]:
+def run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False) -> tuple[Path, dict[str, str]]:
     """The run's folder, or with `many` maybe that of several seeds, and the options of a command that reads it."""
     from pegasus_jax.checks import did_you_mean
     from pegasus_jax.runs import config_io, store
@@ -64,7 +64,7 @@ def _run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False)
     return store.existing(path), defaults | rest
 
 
-def _trial(text: str) -> int | str:
+def trial_of(text: str) -> int | str:
     """The trial whose policy is asked for. Raises ConfigError for a text that names none."""
     if text in ("last", "best"):
         return text

@@ -1,0 +1,56 @@
+"""The command pegasus-export: a run's policy as a file that runs without this package."""
+
+import json
+from collections.abc import Sequence
+
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.cli.main import main
+from pegasus_jax.cli.runs import run_and, trial_of
+
+EXPORT = """\
+pegasus-export RUN [trial=best] [format=numpy] [out=FILE] [overwrite=false]     a policy that runs anywhere
+
+Writes the policy after trial=N, trial=last or the best trial as one file that needs neither this package nor JAX, and
+beside it FILE.json, its contract: names, units and order of observations and controls, limits, period, versions. The
+file's controls are compared with the policy's own on 1,000 observations, stored and random ones; a file that differs
+by more than 1e-5 of the control range is not kept.
+
+  format=numpy          a Python module of plain NumPy with its weights inside (default: RUN/controller.py)
+         c              a C99 header without allocation; a C compiler is needed to compare it (RUN/controller.h)
+         onnx           a graph for onnxruntime and others, of a batch of observations (RUN/controller.onnx)
+         stablehlo      a function for jax.export.deserialize, of any policy (RUN/controller.stablehlo)
+
+onnx and stablehlo need the extra `export`: pip install 'pegasus-jax[export]'.
+
+examples
+  pegasus-export runs/cartpole-seed0
+  pegasus-export runs/cartpole-seed0 format=c trial=12 out=firmware/balance.h
+"""
+
+
+def export() -> None:
+    """Entry point of pegasus-export."""
+    main(handle, EXPORT, stopped="nothing was written")
+
+
+def handle(words: Sequence[str]) -> None:
+    """Export a policy, and say how close the file is to it. Raises ConfigError for words that cannot be."""
+    run, rest = run_and(words, {"trial": "best", "format": "numpy", "out": "", "overwrite": "false"})
+    if rest["overwrite"] not in ("true", "false"):
+        raise ConfigError(f"overwrite={rest['overwrite']} is neither true nor false")
+    trial = trial_of(rest["trial"])
+    from pegasus_jax.exports import write
+
+    file = write.export(run, trial, rest["format"], rest["out"] or None, rest["overwrite"] == "true")
+    contract = json.loads(write.contract_of(file).read_bytes())
+    parity = contract["parity"]
+    print(f"{file}: {contract['title']}")
+    print(f"{write.contract_of(file)}: its contract")
+    print(
+        f"it differs from the policy by at most {parity['largest_difference']:.1e} of the control range on"
+        f" {parity['observations']:,} observations, {parity['stored']} of them stored ({parity['allowed']:.1e} is allowed)"
+    )
+
+
+if __name__ == "__main__":
+    export()

@@ -1,0 +1,1 @@
+"""A learned policy as a file that runs without this package: NumPy, C, ONNX or StableHLO."""

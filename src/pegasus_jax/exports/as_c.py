@@ -1,0 +1,192 @@
+"""A controller as one C99 header: tables and one function, without allocation and without a library but libm."""
+
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+import textwrap
+from pathlib import Path
+
+import numpy as np
+
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Squash, Standardize, layers_of
+from pegasus_jax.exports.learned import Learned, said
+
+HEADER = """\
+/* {title}, as written by pegasus-export.
+ *
+ * C99 (or C++), no allocation, nothing but <math.h>: link with -lm, do not compile with -ffast-math.
+ *
+ *     {type} x[{observations}] = {{...}}, u[{controls}];
+ *     {name}_reset();                     before every episode
+ *     if ({name}_act(x, u) != 0) ...      an observation is not finite: u is as it was, stop the motors
+ *
+ * x  {observation}
+ * u  {control}
+ *
+ * Written by a program: change the run, and export it again.
+ */
+#ifndef {guard}_H
+#define {guard}_H
+
+#include <math.h>
+
+#define {guard}_OBSERVATIONS {observations}
+#define {guard}_CONTROLS {controls}
+#define {guard}_PERIOD {period!r} /* s, from one control to the next */
+
+{arrays}
+
+/* Forget the episode so far. It remembers nothing; a controller that filters its sensors will. */
+static inline void {name}_reset(void) {{}}
+
+/* u [{controls}] for x [{observations}]; 0, or 1 where a number of x is not finite. */
+static inline int {name}_act(const {type} *x, {type} *u) {{
+{code}
+    return 0;
+}}
+
+#endif
+"""
+
+CHECK = """\
+#include <stdio.h>
+#include "{name}.h"
+int main(void) {{
+    {type} x[{observations}], u[{controls}];
+    while (fread(x, sizeof *x, {observations}, stdin) == {observations}) {{
+        {name}_reset();
+        if ({name}_act(x, u) || fwrite(u, sizeof *u, {controls}, stdout) != {controls}) return 1;
+    }}
+    return 0;
+}}
+"""
+
+TYPES = {"float32": ("float", "f"), "float64": ("double", "")}  # and the end of the names of its numbers and functions
+
+
+def write(learned: Learned, name: str) -> bytes:
+    """The header's text; its names begin with `name`. Raises ConfigError for a policy that is no list of layers."""
+    layers, observations = layers_of(learned, "c"), len(learned.observation)
+    real, suffix = TYPES[learned.dtype.name]
+    code = [f"for (int i = 0; i < {observations}; ++i) if (!isfinite(x[i])) return 1;"]
+    arrays, size = {}, 0
+    for number, layer in enumerate(layers):
+        lines, used, size = _printed(layer, number, size)
+        code += lines
+        arrays |= used
+    fill = {"T": real, "F": suffix, "P": name}
+    return HEADER.format(
+        title=said(learned.title),
+        type=real,
+        name=name,
+        guard=name.upper(),
+        observations=observations,
+        controls=len(learned.task.control_names),
+        observation=said(", ".join(learned.observation)),
+        control=said(", ".join(learned.task.control_names)),
+        period=float(learned.task.dt),
+        arrays="\n".join(_table(f"{name}_{key}", value) for key, value in arrays.items()),
+        code=textwrap.indent(
+            "\n".join(re.sub(r"@([TFP])", lambda found: fill[found[1]], line) for line in code), "    "
+        ),
+    ).encode()
+
+
+def _printed(layer: Layer, i: int, size: int) -> tuple[list[str], dict[str, np.ndarray], int]:
+    """The lines of a layer, the tables that they name, and its size; v{i-1} [size] goes in, v{i} comes out.
+
+    @T is the type of numbers, @F the end of a function's or a number's name of that type, @P the prefix of names.
+    """
+    before = f"v{i - 1}"
+    match layer:
+        case Features(plain, angles):
+            lines, count = [f"@T v{i}[{layer.size}];"], len(angles)
+            lines += [f"v{i}[{place}] = x[{entry}];" for place, entry in enumerate(plain)]
+            for place, pair in enumerate(angles, start=len(plain)):
+                angle = f"x[{pair[0]}]" if len(pair) == 1 else f"atan2@F(x[{pair[1]}], x[{pair[0]}])"
+                lines += [f"v{i}[{place}] = sin@F({angle});", f"v{i}[{place + count}] = cos@F({angle});"]
+            return lines, {}, layer.size
+        case Standardize(mean, scale):
+            loop = f"for (int i = 0; i < {size}; ++i) v{i}[i] = ({before}[i] - @P_mean{i}[i]) / @P_scale{i}[i];"
+            return [f"@T v{i}[{size}];", loop], {f"mean{i}": mean, f"scale{i}": scale}, size
+        case Dense(kernel, bias, relu):
+            width = len(bias)
+            # Along the outputs: a compiler can do several at once without another order of sums.
+            lines = [
+                f"@T v{i}[{width}];",
+                f"for (int j = 0; j < {width}; ++j) v{i}[j] = @P_bias{i}[j];",
+                f"for (int i = 0; i < {size}; ++i)",
+                f"    for (int j = 0; j < {width}; ++j) v{i}[j] += {before}[i] * @P_kernel{i}[i * {width} + j];",
+            ]
+            if relu:
+                lines.append(f"for (int j = 0; j < {width}; ++j) v{i}[j] = v{i}[j] > 0 ? v{i}[j] : 0;")
+            return lines, {f"kernel{i}": kernel, f"bias{i}": bias}, width
+        case Kernels(centers, lengthscales, weights):
+            controls, count = weights.shape
+            lines = [
+                f"@T v{i}[{controls}];",
+                f"for (int k = 0; k < {controls}; ++k) {{",
+                "    double sum = 0;",
+                f"    for (int n = 0; n < {count}; ++n) {{",
+                "        double squares = 0;",
+                f"        for (int i = 0; i < {size}; ++i) {{",
+                f"            const double far = ({before}[i] - @P_centers{i}[n * {size} + i])"
+                f" / @P_lengthscales{i}[k * {size} + i];",
+                "            squares += far * far;",
+                "        }",
+                f"        sum += @P_weights{i}[k * {count} + n] * exp(-0.5 * squares);",
+                "    }",
+                f"    v{i}[k] = (@T)sum;",
+                "}",
+            ]
+            return lines, {f"centers{i}": centers, f"lengthscales{i}": lengthscales, f"weights{i}": weights}, controls
+        case Squash(kind, low, high):
+            squash = {"tanh": f"tanh@F({before}[i])", "sine": "(3 * s - s * s * s) / 2"}[kind]
+            lines = [
+                f"for (int i = 0; i < {len(low)}; ++i) {{",
+                *([f"    const @T s = sin@F({before}[i]);"] if kind == "sine" else []),
+                f"    const @T v = @P_middle[i] + @P_half[i] * {squash};",
+                "    u[i] = v < @P_low[i] ? @P_low[i] : v > @P_high[i] ? @P_high[i] : v;",
+                "}",
+            ]
+            return lines, {"low": low, "high": high, "middle": layer.middle, "half": layer.half}, len(low)
+
+
+def _table(name: str, array: np.ndarray) -> str:
+    """A table of numbers that read back to the last bit."""
+    real, suffix = TYPES[array.dtype.name]
+    numbers = ", ".join(str(value) + suffix for value in array.ravel())
+    return f"static const {real} {name}[{array.size}] = {{\n{textwrap.fill(numbers, 112, break_on_hyphens=False)}\n}};"
+
+
+def compiler() -> list[str]:
+    """The command of a C compiler: $CC, or the first of cc, gcc and clang. Raises ConfigError without one."""
+    found = shlex.split(os.environ.get("CC", "")) or [name for name in ("cc", "gcc", "clang") if shutil.which(name)][:1]
+    if not found or not shutil.which(found[0]):
+        raise ConfigError(
+            "format=c needs a C compiler to compare the header with the policy, and there is no cc, gcc or clang here"
+            " (CC=... names another); format=numpy needs none"
+        )
+    return found
+
+
+def run(path: Path, observations: np.ndarray) -> np.ndarray:
+    """What the header at `path` does for observations [N, O], compiled for this machine: controls [N, U]."""
+    name, text = path.stem, path.read_text()
+    controls = int(re.search(rf"define {name.upper()}_CONTROLS (\d+)", text)[1])  # type: ignore[index]
+    check = CHECK.format(
+        name=name, type=TYPES[observations.dtype.name][0], observations=observations.shape[1], controls=controls
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        program = Path(folder) / "check"
+        program.with_suffix(".c").write_text(check)
+        command = [*compiler(), "-std=c99", "-O2", "-I", str(path.parent), f"{program}.c", "-o", str(program), "-lm"]
+        for words, given in ((command, None), ([str(program)], observations.tobytes())):
+            done = subprocess.run(words, input=given, capture_output=True, check=False)
+            if done.returncode:
+                raise ConfigError(f"format=c: {words[0]} failed: {' '.join(done.stderr.decode().split())[:200]}")
+    return np.frombuffer(done.stdout, observations.dtype).reshape(-1, controls)

@@ -1,0 +1,47 @@
+"""What whoever drives the robot must know of an exported controller, as JSON: names, units, order, limits, period."""
+
+import hashlib
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pegasus_jax.exports.learned import Learned
+from pegasus_jax.exports.parity import Parity
+from pegasus_jax.runs.machine import about
+
+
+def contract(learned: Learned, format: str, file: Path, data: bytes, parity: Parity, command: str) -> dict[str, Any]:
+    """The contract of a file of these bytes. Observations and controls are in the order of their entries."""
+    task = learned.task
+    low, high = (np.asarray(limit, float).tolist() for limit in (task.control_low, task.control_high))
+    controls = zip(task.control_names, low, high, strict=True)
+    cosines = {entry: part for pair in task.circles for entry, part in zip(pair, ("cosine", "sine"), strict=True)}
+    return {
+        "file": file.name,
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "format": format,
+        "title": learned.title,
+        "task": task.name,
+        "run": learned.run,
+        "trial": learned.trial,
+        "numbers": learned.dtype.name,
+        "period_s": float(task.dt),
+        "observation": [
+            named(name) | ({"is": f"{cosines[i]} of an angle"} if i in cosines else {})
+            for i, name in enumerate(learned.observation)
+        ],
+        "control": [named(name) | {"low": low, "high": high} for name, low, high in controls],
+        "filter": "none",
+        "history": "none",
+        "parity": {**parity._asdict(), "allowed": parity.allowed, "against": "pegasus_jax.controller"},
+        "command": command,
+        "versions": about(command)["versions"],
+    }
+
+
+def named(name: str) -> dict[str, Any]:
+    """A name and its unit, which is null where it is not known: "theta [rad]" is theta in rad."""
+    found = re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", name)
+    return {"name": found[1], "unit": found[2]} if found else {"name": name, "unit": None}

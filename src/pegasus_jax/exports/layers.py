@@ -1,0 +1,125 @@
+"""A learned controller as data: a short list of layers. Each format prints code for these, and knows no policies."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.config import MLP, RBF, Linear
+from pegasus_jax.exports.learned import Learned
+from pegasus_jax.math.circles import entries
+from pegasus_jax.pilco.rbf import regress
+from pegasus_jax.runs.restore import precision
+from pegasus_jax.types import Params, Task
+
+
+class Features(NamedTuple):
+    """v = entries of the observation as they are, then sines of all angles, then their cosines (`angles.encode`)."""
+
+    plain: tuple[int, ...]
+    angles: tuple[tuple[int, ...], ...]  # (entry,) [rad], or (entry of the cosine, entry of the sine)
+
+    @property
+    def size(self) -> int:
+        """F."""
+        return len(self.plain) + 2 * len(self.angles)
+
+
+class Standardize(NamedTuple):
+    """v = (v - mean) / scale."""
+
+    mean: np.ndarray  # [F]
+    scale: np.ndarray  # [F]
+
+
+class Dense(NamedTuple):
+    """v = v @ kernel + bias, and max(v, 0) with `relu`."""
+
+    kernel: np.ndarray  # [inputs, outputs]
+    bias: np.ndarray  # [outputs]
+    relu: bool
+
+
+class Kernels(NamedTuple):
+    """v_u = sum over n of weights_un exp(-|(v - centers_n) / lengthscales_u|^2 / 2) (docs/reference.md 5.1).
+
+    In double precision, whatever the controller's is: weights of 50 and more cancel.
+    """
+
+    centers: np.ndarray  # [n, F]
+    lengthscales: np.ndarray  # [U, F]
+    weights: np.ndarray  # [U, n]
+
+
+class Squash(NamedTuple):
+    """u = middle + half * squash(v), within the limits; tanh, or sine: (3 sin v - sin^3 v) / 2."""
+
+    kind: str
+    low: np.ndarray  # [U]
+    high: np.ndarray  # [U]
+
+    @property
+    def middle(self) -> np.ndarray:
+        """[U]."""
+        return (self.high + self.low) / 2
+
+    @property
+    def half(self) -> np.ndarray:
+        """[U]."""
+        return (self.high - self.low) / 2
+
+
+Layer = Features | Standardize | Dense | Kernels | Squash
+
+
+def layers_of(learned: Learned, format: str) -> tuple[Layer, ...]:
+    """The layers of a policy, from the observation to the control. A new kind of policy is added here alone.
+
+    Raises ConfigError for a policy that these layers cannot express.
+    """
+    settings, params, dtype = learned.config.policy, learned.params, learned.dtype
+    match settings:
+        case MLP():
+            middle = _network(settings, params, dtype)
+        case Linear():
+            middle = [Dense(_array(params["weights"], dtype).T, _array(params["bias"], dtype), False)]
+        case RBF():
+            with precision(learned.config):
+                lengthscales, beta = jax.jit(regress)(params)
+            middle = [Kernels(*(_array(value, np.float64) for value in (params["centres"], lengthscales, beta)))]
+        case _:
+            raise ConfigError(f"format={format} cannot write this policy; the nearest is format=stablehlo")
+    low, high = (_array(limit, dtype) for limit in (learned.task.control_low, learned.task.control_high))
+    return (_features(learned.task), *middle, Squash(settings.squash, low, high))
+
+
+def _features(task: Task) -> Features:
+    """Where the features of the state are in the observation."""
+    size, pair_at = len(task.state_names) + len(task.circles), {min(pair): pair for pair in task.circles}
+    kept = entries(size, task.circles)
+    plain = tuple(entry for i, entry in enumerate(kept) if i not in task.angles)
+    return Features(plain, tuple(tuple(pair_at.get(kept[i], (kept[i],))) for i in task.angles))
+
+
+def _network(settings: MLP, params: Params, dtype: np.dtype) -> list[Layer]:
+    """The layers of the mean of a network: noise on the units is its mean, which the kernels take in."""
+    mean, scale = (_array(value, np.float64) for value in params["input"])
+    units = _units(settings, len(mean))
+    dense = [params["network"]["params"][f"layer_{i}"] for i in range(len(settings.hidden) + 1)]
+    layers: list[Layer] = []
+    if np.any(mean != 0) or np.any(scale * units != 1):
+        layers.append(Standardize((mean * units).astype(dtype), (scale * units).astype(dtype)))
+    for i, layer in enumerate(dense):
+        kernel = _array(layer["kernel"], np.float64) * (1 - settings.dropout if i else 1)
+        layers.append(Dense(kernel.astype(dtype), _array(layer["bias"], dtype), relu=i < len(settings.hidden)))
+    return layers
+
+
+def _units(settings: MLP, features: int) -> np.ndarray:
+    """The unit of each feature; sines and cosines, the last ones, have none."""
+    return np.concatenate([settings.input_units, np.ones(features - len(settings.input_units))])
+
+
+def _array(values: object, dtype: np.dtype | type) -> np.ndarray:
+    return np.asarray(values).astype(dtype)

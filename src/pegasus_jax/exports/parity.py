@@ -1,0 +1,82 @@
+"""Whether a file is the policy: its controls beside those of `pegasus_jax.controller`."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from pegasus_jax.checks import RunError
+from pegasus_jax.exports.learned import Learned, function
+from pegasus_jax.math.circles import to_observation
+from pegasus_jax.runs import store
+from pegasus_jax.types import Task
+
+OBSERVATIONS = 1000  # half of them stored, as far as there are so many
+ALLOWED = 1e-5  # of the control range, beside what the policy and the file round
+
+
+class Parity(NamedTuple):
+    """How far a file's controls are from the policy's, as fractions of the control range."""
+
+    observations: int
+    stored: int  # of these, from the run's episodes; the others are random
+    largest_difference: float
+    # From the policy to itself in double precision, with the same weights: what its own numbers cannot tell. 1e-7 for a
+    # network; up to 1e-5 for radial basis functions in single precision, whose large weights cancel.
+    rounding: float
+
+    @property
+    def allowed(self) -> float:
+        """The most that `largest_difference` may be: both, the policy and the file, round."""
+        return ALLOWED + 2 * self.rounding
+
+
+def observations(run: Path, task: Task) -> tuple[np.ndarray, int]:
+    """Observations [1000, O], the first of which were stored by the run, and how many.
+
+    The others are uniform in the states' own box, widened by half its width on each side.
+    """
+    draw = np.random.default_rng(0)
+    episodes = [store.load_episode(run, trial) for trial in store.numbered(run / "episodes", ".npz")]
+    seen = [np.asarray(episode.trajectory.x, float) for episode in episodes if episode is not None]
+    start, std = np.asarray(task.start_mean, float), np.asarray(task.start_std, float)
+    every = np.concatenate([*seen, [start - std, start + std]])
+    stored = draw.permutation(every[:-2])[: OBSERVATIONS // 2]
+    low, high = every.min(0), every.max(0)
+    margin = (high - low) / 2
+    others = draw.uniform(low - margin, high + margin, (OBSERVATIONS - len(stored), len(low)))
+    return to_observation(np.concatenate([stored, others]), task.circles), len(stored)
+
+
+def compared(
+    run: Callable[[np.ndarray], np.ndarray], learned: Learned, reference: Callable[[Any], np.ndarray], folder: Path
+) -> Parity:
+    """What `run`, the file, makes of observations [N, O] of the run in `folder`, beside `reference`: its `controller`.
+
+    Raises RunError where the difference is more than is allowed.
+    """
+    task = learned.task
+    given, stored = observations(folder, task)
+    given = given.astype(learned.dtype)
+    expected, found = np.stack([reference(x) for x in given]), run(given)
+    if found.shape != expected.shape:
+        raise RunError(f"the file returns controls {[*found.shape]}, the policy {[*expected.shape]}; it was not kept")
+    span = np.asarray(task.control_high) - np.asarray(task.control_low)
+    difference = np.abs(found.astype(float) - expected) / span
+    rounding = np.abs(expected - exact(learned, given)) / span
+    parity = Parity(len(given), stored, float(difference.max()), float(rounding.max()))
+    if not parity.largest_difference <= parity.allowed:  # NaN is none
+        worst = given[int(np.argmax(np.where(np.isnan(difference), np.inf, difference).max(-1)))]
+        raise RunError(
+            f"the file's controls differ from the policy's by {parity.largest_difference:.2g} of the control range, at"
+            f" {worst.tolist()}; at most {parity.allowed:.2g} is allowed, and it was not kept"
+        )
+    return parity
+
+
+def exact(learned: Learned, given: np.ndarray) -> np.ndarray:
+    """The controls [N, U] of a policy in double precision, with the same weights and observations [N, O]."""
+    with jax.enable_x64(True):
+        return np.asarray(jax.jit(jax.vmap(function(learned)))(given.astype(np.float64)))
