@@ -46,10 +46,9 @@ def handle(words: Sequence[str]) -> None:
     parity = contract["parity"]
     print(f"{file}: {contract['title']}")
     print(f"{write.contract_of(file)}: its contract")
-    print(
-        f"it differs from the policy by at most {parity['largest_difference']:.1e} of the control range on"
-        f" {parity['observations']:,} observations, {parity['stored']} of them stored ({parity['allowed']:.1e} is allowed)"
-    )
+    seen, stored = (f"{parity[name]:,}" for name in ("observations", "stored"))
+    print(f"{seen} observations, {stored} of them stored: it differs from the policy by at most", end=" ")
+    print(f"{parity['largest_difference']:.1e} of the control range; {parity['allowed']:.1e} is allowed")
 
 
 if __name__ == "__main__":
