@@ -31,7 +31,7 @@ CODE = [path for top in ("src", "envs", "tests", "benchmarks") for path in sorte
 class Block(NamedTuple):
     """A fenced block of a page."""
 
-    kind: str  # python, xml, math, or "" for commands
+    kind: str  # python, xml, c, math, or "" for commands
     text: str
     file: str  # what the paragraph above calls it, "" for no file
 
@@ -41,7 +41,7 @@ def blocks(page: Path) -> list[Block]:
     found, text = [], page.read_text()
     for match in re.finditer(r"^```(\w*)\n(.*?)^```$", text, re.DOTALL | re.MULTILINE):
         above = text[: match.start()].rstrip().rpartition("\n\n")[2]
-        names = re.findall(r"`(\w+\.(?:py|xml|toml))`", above) if match[1] in ("python", "xml", "toml") else []
+        names = re.findall(r"`(\w+\.(?:py|xml|toml|c))`", above) if match[1] in ("python", "xml", "toml", "c") else []
         found.append(Block(match[1], match[2], names[-1] if names else ""))
     return [block for block in found if block.kind != "math"]
 
@@ -127,6 +127,8 @@ def shell(command: str, folder: Path, environment: dict[str, str]) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("page", RUN)
 def test_a_page_runs_from_the_top_to_the_end(page: Path, tmp_path: Path, tools: dict[str, str]) -> None:
+    if any(block.kind == "c" for block in blocks(page)) and not shutil.which("cc"):
+        pytest.skip("the page compiles C, and there is no cc")
     for name in CHECKOUT:
         (shutil.copytree if (ROOT / name).is_dir() else shutil.copy2)(ROOT / name, tmp_path / name)
     own = {block.file for block in blocks(page)}
@@ -195,12 +197,13 @@ def test_method_commands_are_settings(command: str) -> None:
 def test_every_block_is_a_program_a_file_or_commands() -> None:
     for page in PAGES:
         for block in blocks(page):
-            assert block.kind in ("", "bash", "sh", "python", "xml", "toml"), f"{page.name}: {block.kind}"
-            if block.kind in ("xml", "toml"):
+            assert block.kind in ("", "bash", "sh", "python", "xml", "toml", "c"), f"{page.name}: {block.kind}"
+            if block.kind in ("xml", "toml", "c"):
                 assert block.file, f"{page.name} does not say what the file is called: {block.text[:40]}"
             for command in commands(block) if block.kind in ("", "bash", "sh") else ():
-                assert shlex.split(command)[0].startswith(("pegasus-", "make", "python")), command
-    assert {block.file for block in FILES} == {"mymodule.py", "arm.xml", "robot.py", "drive.py"}
+                assert shlex.split(command)[0].startswith(("pegasus-", "make", "python", "cc")), command
+    of_plants = {"mymodule.py", "arm.xml", "robot.py", "drive.py"}
+    assert {block.file for block in FILES} == of_plants | {"on_robot.py", "robot.c", "in_runtimes.py", "export_both.py"}
     assert len(PROGRAMS) >= 4
 
 
