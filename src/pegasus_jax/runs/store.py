@@ -143,15 +143,23 @@ def save_episode(run: Path, trial: int, episode: Trajectory, task: Task, *, poli
     Kept are the `episode.length` control periods that it lasted, all of them where that is None; `policy` is the trial
     after which the policy that ran was learned, 0 for random controls; `ended` is one of `ENDED`.
     """
+    arrays = episode_arrays(run, trial, episode, task, policy=policy, ended=ended)
+    write_whole(episode_path(run, trial), lambda file: np.savez(file, **arrays))  # type: ignore[arg-type]
+
+
+def episode_arrays(
+    run: Path, trial: int, episode: Trajectory, task: Task, *, policy: int, ended: str
+) -> dict[str, Any]:
+    """What the file of an episode holds, by name."""
     length = len(episode.u) if episode.length is None else int(episode.length)
-    arrays = dict(
+    arrays: dict[str, Any] = dict(
         x=np.asarray(episode.x)[: length + 1], u=np.asarray(episode.u)[:length], cost=np.asarray(episode.cost)[:length]
     )
     known = dict(state_names=task.state_names, control_names=task.control_names, dt=task.dt, horizon=task.horizon)
     if task.circles:  # x has angles for some of its cosines and sines
         known |= dict(observation=to_observation(arrays["x"], task.circles), circles=task.circles)
     known |= dict(task=task_of(run).name, trial=trial, policy=policy, ended=ended)
-    write_whole(episode_path(run, trial), lambda file: np.savez(file, **arrays, **known))  # type: ignore[arg-type]
+    return arrays | known
 
 
 def load_episode(run: Path, trial: int) -> Episode | None:

@@ -1,0 +1,65 @@
+"""The command pegasus-run: a run's environment, maybe a robot, driven by its exported policy."""
+
+from collections.abc import Sequence
+
+from pegasus_jax.checks import ConfigError, check_range, whole
+from pegasus_jax.cli.main import main
+from pegasus_jax.cli.runs import run_and, trial_of
+
+RUN = """\
+pegasus-run RUN [trial=best] [episodes=1] [seconds=...] [watchdog=...]     drive the environment of a run by its policy
+
+The policy after trial=N, trial=last or the best trial is exported to NumPy, compared with itself, and drives the
+environment of a task=gym, which may be a robot, at its control period. Nothing is learned.
+
+  episodes=1            so many, each with a reset of the environment; seed=0 is given to the first
+  seconds=...           how long one takes (default: as long as those that the run learned from)
+  watchdog=...          close the environment where no control was sent for so many seconds (default: five periods, and
+                        at least 0.5): its step hangs, or the computer is too slow
+
+Each episode leaves RUN/driven/NNNN.npz, with the arrays of the run's own episodes, `time` [s], when each control was
+sent, and `overruns`, how many of them were sent more than a tenth of a period late. Ctrl-C stops the motors: the
+environment is closed, and the rows so far are kept. With a `step` that does not wait, the command keeps the period.
+
+examples
+  pegasus-run runs/gym-robot-Arm-v0-seed0
+  pegasus-run runs/gym-robot-Arm-v0-seed0 trial=12 seconds=60 watchdog=0.2
+"""
+
+
+def run() -> None:
+    """Entry point of pegasus-run."""
+    main(handle, RUN, stopped="its rows are kept")
+
+
+def handle(words: Sequence[str]) -> None:
+    """Drive, and say how each episode went. Raises ConfigError for words that cannot be."""
+    defaults = {"trial": "best", "episodes": "1", "seed": "0", "seconds": "", "watchdog": ""}
+    folder, rest = run_and(words, defaults)
+    episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
+    seconds, watchdog = (_seconds(name, rest[name]) for name in ("seconds", "watchdog"))
+    trial = trial_of(rest["trial"])
+    from pegasus_jax.exports.drive import drives
+
+    given = dict(episodes=episodes, seed=seed, seconds=seconds, watchdog=watchdog)
+    for done in drives(folder, trial, **given):  # type: ignore[arg-type]
+        count, cost = len(done.times), float(done.episode.trajectory.cost.mean())
+        print(f"{done.log}: {count} controls, mean cost {cost:.3f}, ended by {done.episode.ended};", end=" ")
+        longest = f"the longest of {done.period:g} s took {done.longest:.4g} s"
+        print(f"{done.overruns} overruns, {longest}", flush=True)
+
+
+def _seconds(name: str, text: str) -> float | None:
+    """So many seconds, None where nothing is said. Raises ConfigError for what is no number above 0."""
+    if not text:
+        return None
+    try:
+        value = float(text)
+    except ValueError as error:
+        raise ConfigError(f"{name}={text} is not a number of seconds; for example {name}=2.5") from error
+    check_range(name, value, 0, 86400, open_low=True)
+    return value
+
+
+if __name__ == "__main__":
+    run()

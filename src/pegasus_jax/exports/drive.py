@@ -1,0 +1,156 @@
+"""A run's environment, driven by its exported policy: on time, watched, and logged."""
+
+import gc
+import runpy
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax import episode, interrupt, tasks
+from pegasus_jax.checks import ConfigError, RunError, check_range
+from pegasus_jax.exports.watchdog import Watchdog
+from pegasus_jax.exports.write import export
+from pegasus_jax.math.circles import to_observation
+from pegasus_jax.runs import restore, store
+from pegasus_jax.runs.collect import failed
+from pegasus_jax.runs.files import write_whole
+from pegasus_jax.types import Episode, Task, Trajectory
+
+SLACK = 0.1  # of a period, by which a control may follow the one before it too late
+FOLDER = "driven"  # in a run's folder
+
+
+class Drive(NamedTuple):
+    """An episode that was driven, and how well it kept its time."""
+
+    log: Path
+    episode: Episode
+    period: float  # [s]
+    times: np.ndarray  # [L] when each control was sent [s], from the first on
+
+    @property
+    def longest(self) -> float:
+        """The longest time from one control to the next [s]."""
+        return float(np.diff(self.times).max(initial=0.0))
+
+    @property
+    def overruns(self) -> int:
+        """How many controls were sent more than a tenth of a period late."""
+        return overruns(self.times, self.period)
+
+
+def overruns(times: np.ndarray, period: float) -> int:
+    """How many of these times [s] follow the one before them by more than a period and its slack."""
+    return int(np.sum(np.diff(times) > (1 + SLACK) * period))
+
+
+def drives(
+    run: Path,
+    trial: restore.Trial = restore.BEST,
+    *,
+    episodes: int = 1,
+    seed: int = 0,
+    seconds: float | None = None,
+    watchdog: float | None = None,
+) -> Iterator[Drive]:
+    """Drive the environment of a run by its exported policy, and log each episode in RUN/driven.
+
+    An episode takes as long as those of the run, or `seconds`. The watchdog stops it where no control was sent for so
+    many seconds: five periods, and at least half a second, where that is None. Raises ConfigError for a task without an
+    environment, and RunError where an episode failed; its rows are logged.
+    """
+    _, experiment, state = restore.ready(run, trial)
+    task = experiment.task
+    if task.environment is None:
+        raise ConfigError(f"task={task.name} has no environment to drive; pegasus-eval RUN runs its simulation")
+    limit = max(0.5, 5 * task.dt) if watchdog is None else watchdog
+    check_range("watchdog", limit, task.dt, open_low=True)
+    task = task._replace(horizon=task.horizon if seconds is None else max(1, round(seconds / task.dt)))
+    with tempfile.TemporaryDirectory() as folder:
+        control = runpy.run_path(str(export(run, int(state.trial), out=Path(folder) / "policy.py")))["Controller"]()
+    gc.freeze()  # nothing that is there is looked at by the garbage collector while the robot moves
+    try:
+        for number in range(episodes):
+            control.reset()
+            with interrupt.held():  # a log is written before a signal is heard again
+                done = _driven(run, task, control, int(state.trial), seed + number, limit)
+            yield done
+    finally:
+        tasks.close(task)
+        gc.unfreeze()
+
+
+def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy: int, seed: int, limit: float) -> Drive:
+    """One episode, logged. Raises RunError, or the signal, where it failed."""
+    log = run / FOLDER / f"{1 + max(store.numbered(run / FOLDER, '.npz'), default=0):04d}.npz"
+    times: list[float] = []
+    rows: list[Any] = []
+
+    def save(ran: Episode) -> Drive:
+        seen = jnp.asarray(ran.trajectory.x)[1:]
+        cost = np.asarray(jax.vmap(task.cost)(seen) if len(seen) else [], np.float32)
+        kept = ran._replace(trajectory=ran.trajectory._replace(cost=cost))  # type: ignore[arg-type]
+        done = Drive(log, kept, task.dt, np.array(times[: len(ran.trajectory.u)]) - (times[0] if times else 0))
+        _write(run, done, task, policy)
+        return done
+
+    def last_words() -> str:
+        """What is known of an episode whose environment hangs."""
+        x, u = [rows[0], *(x for x, _ in rows[1:])], [u for _, u in rows[1:]]
+        size = len(task.control_names)
+        save(Episode(Trajectory(np.array(x), np.array(u).reshape(-1, size), np.zeros(0)), "interrupted"))  # type: ignore[arg-type]
+        return _stopped(task, limit, len(u), log)
+
+    with Watchdog(limit, task.environment.close, last_words) as watch:
+        on_time = task._replace(environment=timed(task.environment, task.dt, times, rows, watch.beat))
+        ran = episode.drive(seed, lambda t, x: control(to_observation(x, task.circles)), on_time)
+    done = save(ran)
+    if watch.fired:
+        raise RunError(_stopped(task, limit, len(done.times), log))
+    failed(ran, task, f" in {log}" if len(done.times) else "")
+    return done
+
+
+def timed(environment: Any, period: float, times: list[float], rows: list[Any], beat: Callable[[], None]) -> Any:
+    """The environment, each of whose controls is sent when it is due: one period after the one before it, or late."""
+    due = 0.0
+
+    def reset(seed: int) -> np.ndarray:
+        x = environment.reset(seed)
+        rows.append(x)
+        return x
+
+    def step(control: np.ndarray) -> tuple[Any, ...]:
+        nonlocal due
+        now = time.monotonic()
+        if times and now < due:
+            time.sleep(due - now)
+            now = time.monotonic()
+        times.append(now)
+        beat()
+        # After a late one the clock begins again: two controls never follow each other faster than usual to catch up.
+        due = period + (due if len(times) > 1 and now - due < SLACK * period else now)
+        answer = environment.step(control)
+        rows.append(answer[:2])
+        return answer
+
+    return environment._replace(reset=reset, step=step)
+
+
+def _write(run: Path, done: Drive, task: Task, policy: int) -> None:
+    """Write a log: an episode as those of the run, with `time` [L] and `overruns` besides."""
+    number = int(done.log.stem)
+    arrays = store.episode_arrays(run, number, done.episode.trajectory, task, policy=policy, ended=done.episode.ended)
+    timing = {"time": done.times, "overruns": done.overruns}
+    write_whole(done.log, lambda file: np.savez(file, **arrays, **timing))  # type: ignore[arg-type]
+
+
+def _stopped(task: Task, limit: float, rows: int, log: Path) -> str:
+    kept = f"its {rows} rows are kept in {log}"
+    return f"{task.name} was given no control for {limit:g} s, so the watchdog closed it; {kept}"

@@ -1,0 +1,229 @@
+"""pegasus-run: an environment driven on time by the exported policy, stopped where it hangs, logged in any case."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+
+import pegasus_jax
+from folders import TINY, a_run
+from pegasus_jax import tasks
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.cli.drive import handle
+from pegasus_jax.exports.drive import drives, overruns, timed
+from pegasus_jax.runs import config_io
+
+ROBOT = """
+import os, signal, time
+import gymnasium, jax.numpy as jnp, numpy as np
+
+def note(what):
+    with open(os.environ["NOTES"], "a") as file:
+        print(what, file=file)
+
+class Arm(gymnasium.Env):
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+    action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,))
+    dt, count = 0.02, 0
+
+    def reset(self, *, seed=None, options=None):
+        note("reset")
+        self.x = np.array([3.0, 0.0])
+        return self.x, {}
+
+    def step(self, control):
+        Arm.count += 1
+        if Arm.count == 4 and "HANGS" in os.environ:
+            self.hang()
+        if Arm.count == 4 and "BREAKS" in os.environ:
+            raise OSError("the motor driver does not answer")
+        self.x = self.x + 0.02 * np.array([self.x[1], float(control[0])])
+        return self.x, 0.0, False, False, {}
+
+    def hang(self):
+        while True:
+            try:
+                time.sleep(60)
+            except BaseException:
+                if os.environ["HANGS"] == "gently":
+                    raise
+
+    def close(self):
+        note("close")
+
+gymnasium.register("Driven-v0", Arm)
+
+def cost(x):
+    return 1 - jnp.exp(-(x[0] ** 2))
+"""
+WORDS = {"task": "gym", "env": "driven_robot:Driven-v0", "cost": "driven_robot:cost", "angles": "[0]"}
+WORDS |= {"start_mean": "[3,0]", "eval_episodes": "0", "horizon": "10"}
+
+
+@pytest.fixture(scope="module")
+def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the robot's module, and a run of it."""
+    home = tmp_path_factory.mktemp("robot")
+    (home / "driven_robot.py").write_text(ROBOT)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("NOTES", str(home / "notes"))
+        patch.syspath_prepend(str(home))
+        made = tasks.of_config(config_io.parse({**TINY, **WORDS}))
+        a_run(home / "run", trials=2, made=made, **WORDS)
+        tasks.close_environments()
+    return home
+
+
+class Called(NamedTuple):
+    """What a command left."""
+
+    code: int
+    out: str
+    err: str
+    asked: list[str]  # of the robot
+
+
+def driven(home: Path, *words: str, stopped: signal.Signals | None = None, **environment: str) -> Called:
+    """`pegasus-run`, and a signal to it half a second after the robot's reset."""
+    notes = home / "notes"
+    notes.unlink(missing_ok=True)
+    program = [sys.executable, "-P", "-m", "pegasus_jax.cli.drive", "run", *words]
+    told = {
+        **os.environ,
+        "NOTES": str(notes),
+        "PYTHONPATH": f"{home}:{os.environ.get('PYTHONPATH', '')}",
+        **environment,
+    }
+    process = subprocess.Popen(program, cwd=home, env=told, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    if stopped:
+        while not notes.exists() and process.poll() is None:
+            time.sleep(0.05)
+        time.sleep(0.5)
+        process.send_signal(stopped)
+    out, err = process.communicate(timeout=120)
+    return Called(process.returncode, out, err, notes.read_text().split() if notes.exists() else [])
+
+
+def newest(home: Path) -> dict[str, np.ndarray]:
+    with np.load(sorted((home / "run" / "driven").glob("*.npz"))[-1]) as file:
+        return dict(file)
+
+
+def test_a_robot_is_driven_by_the_policy_at_its_period(home: Path) -> None:
+    done = driven(home, "episodes=2", "seconds=0.3", "trial=1")
+    assert (done.code, done.asked) == (0, ["reset", "reset", "close"]), done.err
+    lines = done.out.splitlines()
+    assert len(lines) == 2
+    assert lines[1].startswith("run/driven/0002.npz: 15 controls, mean cost 1.000, ended by horizon; ")
+    log = newest(home)
+    control = pegasus_jax.controller(home / "run", trial=1)
+    np.testing.assert_allclose(log["u"], [control(x) for x in log["x"][:-1]], atol=1e-4)
+    np.testing.assert_allclose(log["cost"], 1 - np.exp(-(log["x"][1:, 0] ** 2)), rtol=1e-5)
+    assert (str(log["ended"]), int(log["policy"]), int(log["trial"]), float(log["dt"])) == ("horizon", 1, 2, 0.02)
+    assert log["time"][0] == 0
+    assert log["time"][-1] > 13.9 * 0.02  # its step does not wait
+    assert int(log["overruns"]) == overruns(log["time"], 0.02)
+
+
+@pytest.mark.parametrize("how", ["gently", "deaf"])
+def test_a_robot_that_hangs_is_closed_and_its_rows_are_kept(home: Path, how: str) -> None:
+    """Where Ctrl-C would end the hanging call, and where nothing does: then the process ends."""
+    began = time.monotonic()
+    done = driven(home, "watchdog=0.4", HANGS=how)
+    assert (done.code, done.asked) == (2, ["reset", "close"]), done.err
+    assert time.monotonic() - began < 60
+    (line,) = (line for line in done.err.splitlines() if line.startswith("pegasus: "))
+    assert "was given no control for 0.4 s, so the watchdog closed it; its 3 rows are kept in run/driven/" in line
+    log = newest(home)
+    assert str(log["ended"]) == "interrupted"
+    assert log["x"].shape == (4, 2)
+    assert log["u"].shape == log["time"][:, None].shape == (3, 1)
+    assert np.isfinite(log["cost"]).all()
+
+
+def test_a_robot_that_fails_is_closed_and_its_rows_are_kept(home: Path) -> None:
+    done = driven(home, BREAKS="1")
+    assert (done.code, done.asked) == (2, ["reset", "close"])
+    (line,) = (line for line in done.err.splitlines() if line.startswith("pegasus: "))
+    assert "the motor driver does not answer" in line
+    assert "its 3 rows are kept in run/driven/" in line
+    assert len(newest(home)["u"]) == 3
+
+
+def test_ctrl_c_closes_the_robot_and_its_rows_are_kept(home: Path) -> None:
+    done = driven(home, "seconds=60", stopped=signal.SIGINT)
+    assert (done.code, done.asked) == (130, ["reset", "close"])
+    assert done.err.splitlines()[-1] == "stopped; its rows are kept"
+    assert 1 < len(newest(home)["u"]) < 500
+
+
+# The clock, on an environment whose steps take as long as they are told
+
+
+class Slow(NamedTuple):
+    reset: Any
+    step: Any
+
+
+def clocked(waits: list[float], period: float) -> np.ndarray:
+    """When controls are sent to an environment whose steps take so long."""
+    times: list[float] = []
+    left = iter(waits)
+
+    def step(u: Any) -> tuple[Any, Any, str]:
+        time.sleep(next(left))
+        return u, u, ""
+
+    plant = timed(Slow(lambda seed: 0, step), period, times, [], lambda: None)
+    plant.reset(0)
+    for _ in waits:
+        plant.step(0)
+    return np.array(times) - times[0]
+
+
+def test_controls_are_a_period_apart_whether_a_step_waits_or_not() -> None:
+    times = clocked([0.0, 0.03, 0.0, 0.02, 0.0], 0.05)
+    assert np.all(times > 0.05 * np.arange(5) - 1e-4)
+    assert np.all(np.diff(times) > 0.05 - 0.1 * 0.05)
+
+
+def test_after_a_late_control_the_others_do_not_hurry() -> None:
+    times = clocked([0.0, 0.2, 0.0, 0.0, 0.0], 0.05)
+    assert times[2] - times[1] > 0.2 - 1e-3
+    assert np.all(np.diff(times) > 0.045)
+    assert overruns(times, 0.05) >= 1
+
+
+def test_an_overrun_is_a_tenth_of_a_period() -> None:
+    assert overruns(np.array([0.0, 0.1, 0.2, 0.305, 0.405]), 0.1) == 0
+    assert overruns(np.array([0.0, 0.1, 0.22, 0.3, 0.5]), 0.1) == 2
+    assert overruns(np.array([0.0]), 0.1) == overruns(np.array([]), 0.1) == 0
+
+
+# What a user does wrong
+
+
+def test_what_cannot_be_is_refused(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for words, complaint in (
+        (["seconds=soon"], "seconds=soon is not a number of seconds; for example seconds=2.5"),
+        (["seconds=0"], "seconds=0 is out of range"),
+        (["episodes=0"], "episodes=0 is not a whole number"),
+        (["watchdgo=1"], "did you mean 'watchdog'"),
+    ):
+        with pytest.raises(ConfigError, match=complaint):
+            handle([str(home / "run"), *words])
+    with pytest.raises(ConfigError, match="task=cartpole has no environment to drive; pegasus-eval"):
+        next(drives(a_run(tmp_path / "run", trials=1)))
+    monkeypatch.syspath_prepend(str(home))
+    monkeypatch.setenv("NOTES", str(tmp_path / "notes"))
+    with pytest.raises(ConfigError, match=r"watchdog=0.01 is out of range; expected a number in \(0.02, inf\)"):
+        next(drives(home / "run", watchdog=0.01))
+    tasks.close_environments()
