@@ -36,6 +36,8 @@ class Arm(gymnasium.Env):
 
     def reset(self, *, seed=None, options=None):
         note("reset")
+        if os.environ.get("BREAKS") == "reset":
+            raise OSError("the motor driver does not answer")
         self.x = np.array([3.0, 0.0])
         return self.x, {}
 
@@ -43,7 +45,7 @@ class Arm(gymnasium.Env):
         Arm.count += 1
         if Arm.count == 4 and "HANGS" in os.environ:
             self.hang()
-        if Arm.count == 4 and "BREAKS" in os.environ:
+        if Arm.count == 4 and os.environ.get("BREAKS") == "step":
             raise OSError("the motor driver does not answer")
         self.x = self.x + 0.02 * np.array([self.x[1], float(control[0])])
         return self.x, 0.0, False, False, {}
@@ -149,13 +151,16 @@ def test_a_robot_that_hangs_is_closed_and_its_rows_are_kept(home: Path, how: str
     assert np.isfinite(log["cost"]).all()
 
 
-def test_a_robot_that_fails_is_closed_and_its_rows_are_kept(home: Path) -> None:
-    done = driven(home, BREAKS="1")
+@pytest.mark.parametrize(("where", "rows"), [("step", 3), ("reset", 0)])
+def test_a_robot_that_fails_is_closed_and_its_rows_are_kept(home: Path, where: str, rows: int) -> None:
+    before = len([*(home / "run").glob("driven/*.npz")])
+    done = driven(home, BREAKS=where)
     assert (done.code, done.asked) == (2, ["reset", "close"])
     (line,) = (line for line in done.err.splitlines() if line.startswith("pegasus: "))
     assert "the motor driver does not answer" in line
-    assert "its 3 rows are kept in run/driven/" in line
-    assert len(newest(home)["u"]) == 3
+    assert (f"its {rows} rows are kept in run/driven/" in line) == bool(rows)
+    assert len([*(home / "run").glob("driven/*.npz")]) - before == bool(rows)
+    assert not rows or len(newest(home)["u"]) == rows
 
 
 def test_ctrl_c_closes_the_robot_and_its_rows_are_kept(home: Path) -> None:

@@ -33,7 +33,10 @@ class EnvSpec(NamedTuple):
 
 
 class EnvPlant(NamedTuple):
-    """An environment as a plant outside of JAX. There is one of it, and only the main thread calls it."""
+    """An environment as a plant outside of JAX.
+
+    There is one of it, and only the main thread calls it, but for the `close` of a watchdog.
+    """
 
     reset: Callable[[int], np.ndarray]
     """seed -> x [D]"""

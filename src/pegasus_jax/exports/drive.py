@@ -12,15 +12,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax import episode, interrupt, tasks
+from pegasus_jax import interrupt, tasks
 from pegasus_jax.checks import ConfigError, RunError, check_range
+from pegasus_jax.episode import Episode, drive
 from pegasus_jax.exports.watchdog import Watchdog
 from pegasus_jax.exports.write import export
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs import restore, store
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.runs.files import write_whole
-from pegasus_jax.types import Episode, Task, Trajectory
+from pegasus_jax.types import Task, Trajectory
 
 SLACK = 0.1  # of a period, by which a control may follow the one before it too late
 FOLDER = "driven"  # in a run's folder
@@ -97,7 +98,8 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
         cost = np.asarray(jax.vmap(task.cost)(seen) if len(seen) else [], np.float32)
         kept = ran._replace(trajectory=ran.trajectory._replace(cost=cost))  # type: ignore[arg-type]
         done = Drive(log, kept, task.dt, np.array(times[: len(ran.trajectory.u)]) - (times[0] if times else 0))
-        _write(run, done, task, policy)
+        if len(done.times):
+            _write(run, done, task, policy)
         return done
 
     def last_words() -> str:
@@ -109,7 +111,7 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
 
     with Watchdog(limit, task.environment.close, last_words) as watch:
         on_time = task._replace(environment=timed(task.environment, task.dt, times, rows, watch.beat))
-        ran = episode.drive(seed, lambda t, x: control(to_observation(x, task.circles)), on_time)
+        ran = drive(seed, lambda t, x: control(to_observation(x, task.circles)), on_time)
     done = save(ran)
     if watch.fired:
         raise RunError(_stopped(task, limit, len(done.times), log))

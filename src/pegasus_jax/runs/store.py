@@ -9,6 +9,8 @@
         trials.jsonl         one JSON object a trial
         checkpoints/0001/    the state after trial 1, with 0001.json: the SHA-256 of each of its files
         tensorboard/         the numbers of trials.jsonl as scalars
+        driven/0001.npz      of pegasus-run, never data: as an episode, with when each control was sent, and overruns
+        controller.py        and .h, .onnx, .stablehlo: of pegasus-export, each with its contract, controller.py.json
 
 Files appear whole or not at all: written beside their place, flushed to disk, then renamed.
 """
