@@ -13,10 +13,12 @@ from pegasus_jax.cli import train as cli_train
 from pegasus_jax.runs import cache, files
 from pegasus_jax.runs.removed import renamed
 
+Always = Callable[[], Sequence[str]]
+
 
 def train() -> None:
     """Entry point of pegasus-train."""
-    main(cli_train.train, help.TRAIN)
+    main(cli_train.train, help.TRAIN, always=_always)
 
 
 def check() -> None:
@@ -49,16 +51,18 @@ def main(
     command: Callable[[Sequence[str]], None],
     text: str,
     stopped: str = "nothing was learned",
+    always: Always = lambda: (),
 ) -> None:
     """Run a command: 0 done, 2 a setting or a run's folder that cannot be, in one line, 130 after Ctrl-C.
 
+    `always` are words that come after those that were typed, if any were.
     Whatever ends it, a robot is let go first, and no thread that still compiles is waited for.
     """
     words = sys.argv[1:]
     interrupt.before_end(_let_robots_go)
     try:
         interrupt.listen()
-        code = _code(command, words, text)
+        code = _code(command, words, text, always)
     except BaseException as error:
         interrupt.clean_up()
         if not (interrupt.asked() or isinstance(error, KeyboardInterrupt)):
@@ -83,11 +87,12 @@ def _let_robots_go() -> None:
         close_environments()
 
 
-def _code(command: Callable[[Sequence[str]], None], words: Sequence[str], text: str) -> int:
+def _code(
+    command: Callable[[Sequence[str]], None], words: Sequence[str], text: str, always: Always = lambda: ()
+) -> int:
     """The exit status of a command that nobody stopped."""
     try:
-        always = _always() if words and command is cli_train.train else ()
-        words = _of_today([*words, *always])
+        words = _of_today([*words, *(always() if words else ())])
         if not words or help.WORDS & {*words}:
             print(help.help_of(text, words), end="")
             return 0 if words else 2

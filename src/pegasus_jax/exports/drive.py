@@ -95,7 +95,7 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
 
     def save(ran: Episode) -> Drive:
         seen = jnp.asarray(ran.trajectory.x)[1:]
-        cost = np.asarray(jax.vmap(task.cost)(seen) if len(seen) else [], np.float32)
+        cost = np.asarray(jax.vmap(task.cost.of_state)(seen) if len(seen) else [], np.float32)
         kept = ran._replace(trajectory=ran.trajectory._replace(cost=cost))  # type: ignore[arg-type]
         done = Drive(log, kept, task.dt, np.array(times[: len(ran.trajectory.u)]) - (times[0] if times else 0))
         if len(done.times):
