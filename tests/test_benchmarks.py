@@ -123,26 +123,26 @@ def test_operations_between_devices_are_counted(line, count):
     assert len(scaling.COLLECTIVE.findall(line)) == count
 
 
-@pytest.mark.parametrize("match", ["true", "false"])
+@pytest.mark.parametrize("match", ["always", "never"])
 @pytest.mark.parametrize("activation", ["silu", "relu"])
 def test_plain_torch_does_the_same_work(match, activation):
     pytest.importorskip("torch", reason="the extra `peers` is not installed")
     from benchmarks.peers import plain_torch
     from benchmarks.peers.compare import disagreement, problem_of
 
-    given = workload({**TINY, "search.moment_matching": match, "model.activation": activation}, horizon=3)
+    given = workload({**TINY, "search.matching": match, "model.activation": activation}, horizon=3)
     found = disagreement(given, problem_of(given), plain_torch.step)
     assert found["objective"] < 1e-5
     assert found["gradient"] < 1e-3
 
 
 @pytest.mark.skipif("PROB_MBRL" not in os.environ, reason="PROB_MBRL names no checkout of prob_mbrl")
-@pytest.mark.parametrize("match", ["true", "false"])
+@pytest.mark.parametrize("match", ["always", "never"])
 def test_prob_mbrl_does_the_same_work(match):
     from benchmarks.peers import of_prob_mbrl
     from benchmarks.peers.compare import layers_of, tensor
 
-    given = workload({**TINY, "search.moment_matching": match}, horizon=3)
+    given = workload({**TINY, "search.matching": match}, horizon=3)
     package = of_prob_mbrl.load(Path(os.environ["PROB_MBRL"]))
     found = of_prob_mbrl.disagreement(package, given, layers_of, tensor)
     assert found["objective"] < 1e-5

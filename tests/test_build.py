@@ -153,8 +153,8 @@ def test_your_own_model_and_policy_take_the_place_of_the_configured_ones():
 @pytest.mark.parametrize(
     ("search", "part"),
     [
-        (dict(particles=2, moment_matching=True), "search.particles=2"),
-        (dict(particles=2, moment_matching=False, standardized_noise=True), "search.particles=2"),
+        (dict(particles=2, matching="always"), "search.particles=2"),
+        (dict(particles=2, matching="never", standardized_noise=True), "search.particles=2"),
     ],
 )
 def test_too_few_particles_for_a_covariance_are_refused(search, part):

@@ -43,7 +43,7 @@ def first_objective(**search):
 
 def test_settings_of_the_search_reach_the_objective():
     plain = first_objective()
-    changes = dict(moment_matching=False, standardized_noise=True, cost_estimator="gaussian", cost_width_start=2.0)
+    changes = dict(matching="never", standardized_noise=True, cost_estimator="gaussian", cost_width_start=2.0)
     values = {name: first_objective(**{name: value}) for name, value in changes.items()}
     assert all(abs(value - plain) > 1e-6 for value in values.values()), values
     assert len(set(values.values())) == len(values)
@@ -68,7 +68,7 @@ def test_a_search_starts_with_the_wider_cost_and_ends_with_the_tasks(of):
 
 
 HELD = dict(steps=4, period=Period(0, 0, 0, 0, 0))  # the same scenarios for every iteration
-ALONE = dict(moment_matching=False, **HELD)
+ALONE = dict(matching="never", **HELD)
 
 
 def test_a_search_that_refines_for_no_iteration_weighs_once_at_its_end():
@@ -158,8 +158,8 @@ def test_what_refines_is_imagined_as_it_was_searched():
         exp, state, _ = searcher(**search)
         return jax.jit(exp.imagine)(state)[1]
 
-    assert np.array_equal(fresh(refine_fraction=0.5), fresh(moment_matching=False))
-    assert not np.array_equal(fresh(refine_fraction=0.0), fresh(moment_matching=False))
+    assert np.array_equal(fresh(refine_fraction=0.5), fresh(matching="never"))
+    assert not np.array_equal(fresh(refine_fraction=0.0), fresh(matching="never"))
 
 
 def test_a_refining_search_in_parts_is_the_whole():
@@ -318,7 +318,7 @@ def test_each_factor_of_the_noise_reaches_its_place():
     """What the policy sees decides its controls, the state's own noise the states."""
 
     def imagined(**search):
-        exp, state, _ = searcher(**{"moment_matching": False, "policy_noise": 0.0, **search})
+        exp, state, _ = searcher(**{"matching": "never", "policy_noise": 0.0, **search})
         return jax.jit(exp.imagine)(state)[0]
 
     plain = imagined()

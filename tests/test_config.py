@@ -36,7 +36,7 @@ def test_the_defaults_are_the_measured_ones():
     assert (c.policy.hidden, c.policy.dropout) == ((200, 200), 0.0)
     assert (c.fit.steps, c.fit.batch_size, c.fit.learning_rate) == (2000, 100, 3e-4)
     assert (c.search.steps, c.search.particles, c.search.learning_rate, c.search.grad_clip) == (1000, 100, 1e-3, 1.0)
-    assert (c.search.moment_matching, c.search.standardized_noise) == (True, False)
+    assert (c.search.matching, c.search.standardized_noise) == ("always", False)
     assert c.search.period == Period(start=1, dynamics=100, policy=1, sensor=1, match=1)
     assert (c.model.activation, c.model.kl_weight, c.search.init) == ("silu", 0.1, "better")
     assert (c.search.cost_estimator, c.search.cost_width_start) == ("gaussian", 4.0)  # docs/decisions/0002
@@ -91,8 +91,8 @@ IMPOSSIBLE = [
     (Search, dict(steps=1.5), "search.steps=1.5 is not a whole number"),
     (
         Search,
-        dict(moment_matching="no"),
-        "search.moment_matching=no is not true or false; for example search.moment_matching=true",
+        dict(standardized_noise="no"),
+        "search.standardized_noise=no is not true or false; for example search.standardized_noise=true",
     ),
     (Search, dict(grad_clip="none"), "search.grad_clip=none is not a number or null"),
     (Search, dict(steps=10**20), "the nearest is 10000000"),

@@ -62,7 +62,7 @@ def composed(model, policy, how):
         small.pop("model.ensemble_size", None)
     if how == "kept":
         small |= {
-            "search.moment_matching": "false",
+            "search.matching": "never",
             "search.cost_estimator": "particles",
             "search.cost_width_start": "1",
             "search.init": "previous",

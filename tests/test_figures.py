@@ -29,7 +29,7 @@ title = "Two clips"
 seeds = "3-4"
 trials = 2
 common = "model=deterministic policy=linear model.hidden=[4] fit.steps=2 search.steps=2 search.particles=5 \
-search.moment_matching=false search.cost_estimator=particles search.cost_width_start=1 \
+search.matching=never search.cost_estimator=particles search.cost_width_start=1 \
 search.init=previous search.refine_fraction=0"
 [variants]
 loose = "search.grad_clip=1"

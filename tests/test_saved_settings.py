@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pegasus_jax import config, config_models
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.config import BNN, MLP, Config, Explore, Fit, Period, Search
+from pegasus_jax.config import BNN, MATCHINGS, MLP, Config, Explore, Fit, Period, Search
 from pegasus_jax.presets import ALGORITHMS
 from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import TASKS
@@ -46,7 +46,7 @@ configs = st.builds(
         particles=whole(2),
         learning_rate=positive,
         grad_clip=st.none() | positive,
-        moment_matching=st.booleans(),
+        matching=st.sampled_from(MATCHINGS),
         standardized_noise=st.booleans(),
         cost_estimator=st.sampled_from(config.COST_ESTIMATORS),
         observation_noise=st.sampled_from(config.OBSERVATION_NOISES),

@@ -61,7 +61,7 @@ SPELLINGS = [
     ("search.grad_clip=1", "search.grad_clip", 1.0),
     ("search.grad_clip=0.5", "search.grad_clip", 0.5),
     ("search.grad_clip=null", "search.grad_clip", None),
-    ("search.moment_matching=false", "search.moment_matching", False),
+    ("search.matching=never", "search.matching", "never"),
     ("search.standardized_noise=true", "search.standardized_noise", True),
     ("search.cost_estimator=particles", "search.cost_estimator", "particles"),
     ("search.init=fresh", "search.init", "fresh"),
@@ -183,9 +183,12 @@ def test_a_cost_of_ones_own_is_matched_and_not_widened(words):
         True,
         0.5,
     )
+    assert (chosen.matching, chosen.visited_starts) == ("narrow", 0.5)  # docs/decisions/0023 and 0024
     assert (
         parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9", "algorithm=paper").search.cost_estimator == "particles"
     )
+    paper = parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9", "algorithm=paper").search
+    assert (paper.matching, paper.visited_starts) == ("always", 0)
 
 
 def test_the_paper_is_a_variant():
@@ -356,7 +359,7 @@ def test_any_yaml_ends_in_a_config_or_in_one_line(key, text):
 TOGETHER = [
     ["model.log_z_min=-.01"],  # narrower than the least scale of its noise
     ["search.particles=2"],
-    ["search.particles=2", "search.moment_matching=false", "search.standardized_noise=true"],
+    ["search.particles=2", "search.matching=never", "search.standardized_noise=true"],
     ["policy=rbf", "algorithm=pilco"],
 ]
 

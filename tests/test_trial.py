@@ -293,7 +293,7 @@ def test_a_search_starts_from_the_better_of_the_old_policy_and_a_fresh_one(offse
         sample=lambda key, posterior: (),
         apply=lambda posterior, draw, x, u: Prediction(jnp.broadcast_to(u, (2,)), jnp.zeros(2)),
     )
-    config = tiny(search__steps=1, search__learning_rate=1e-12, search__moment_matching=False)
+    config = tiny(search__steps=1, search__learning_rate=1e-12, search__matching="never")
     exp = compose(config, task, dynamics=jump, policy=towards)
     state = jax.jit(exp.init)(jax.random.key(0))
     old = {"aim": jnp.full(2, 1.0 + offset)}

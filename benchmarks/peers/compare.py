@@ -65,7 +65,7 @@ def problem_of(work: Workload) -> plain_torch.Problem:
         goal=tensor(goal(task)),
         keep=1.0 - work.config.policy.dropout,
         horizon=task.horizon,
-        match=work.config.search.moment_matching,
+        match=work.config.search.matching != "never",
     )
 
 

@@ -49,7 +49,7 @@ SETTINGS = {
     "model": "gp",
     "policy": "rbf",
     "policy.squash": "tanh",
-    "search.moment_matching": "false",
+    "search.matching": "never",
     "search.cost_estimator": "particles",
     "search.cost_width_start": "1",
     "trials": str(EPISODES),

@@ -137,7 +137,7 @@ def disagreement(package: Any, work: Workload, layers_of: Callable[[Any], Layers
     z = (z - z.mean(0)) / z.std(0, ddof=1)
     rolled = np.stack([np.roll(z, -t, axis=0) for t in range(task.horizon)])
     given = work.scenarios._replace(match=jnp.asarray(rolled))
-    match = matching.match if config.search.moment_matching else matching.keep
+    match = matching.keep if config.search.matching == "never" else matching.match
     value = partial(
         objective,
         dynamics=work.experiment.dynamics,
@@ -156,7 +156,7 @@ def disagreement(package: Any, work: Workload, layers_of: Callable[[Any], Layers
         task.horizon,
         resample_state_noise=False,
         resample_action_noise=False,
-        mm_states=config.search.moment_matching,
+        mm_states=config.search.matching != "never",
         z_mm=tensor(z),
     )
     theirs = torch.stack([of_goal(work, tensor)(x, None) for x in states[1:]]).mean()
@@ -184,7 +184,7 @@ def programs(
         # as in its example, deep_pilco_mm.py, but for the moment matching of the costs, which ours has not
         with contextlib.redirect_stderr(io.StringIO()):
             options: dict[str, Any] = dict(
-                mm_states=config.search.moment_matching, maximize=False, clip_grad=config.search.grad_clip
+                mm_states=config.search.matching != "never", maximize=False, clip_grad=config.search.grad_clip
             )
             package.search(start, dynamics, policy, work.task.horizon, searching, None, steps, **options)
 

@@ -134,9 +134,9 @@ def suite(words: Words, repeats: int, quick: bool) -> dict[str, Row]:
     """Every row. `quick`: the cart-pole's alone, and nothing that grows."""
     rows = {}
     for name in list(SIZES)[: 1 if quick else None]:
-        for match in ("true", "false"):
-            suffix = "" if match == "true" else ", no matching"
-            work = workload({**SIZES[name], "search.moment_matching": match, **words})
+        for match in ("always", "never"):
+            suffix = "" if match == "always" else ", no matching"
+            work = workload({**SIZES[name], "search.matching": match, **words})
             rows[f"search step, {name}{suffix}"] = search_step(work, repeats)
     if not quick:  # for its memory
         work = workload({**SIZES["six-legged swimmer"], "search.particles": "1000", **words})

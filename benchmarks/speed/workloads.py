@@ -89,7 +89,7 @@ def workload(words: dict[str, str], horizon: int | None = None) -> Workload:
     posterior = jax.jit(dynamics.posterior)(state.model.params, state.data)
     blocks = blocks_of(config.search.particles, task, dynamics, policy)
     scenarios = jax.jit(partial(draw, blocks=blocks, period=Period()))(jax.random.key(1), 0, posterior)
-    match = matching.match if config.search.moment_matching else matching.keep
+    match = matching.keep if config.search.matching == "never" else matching.match
     value = partial(objective, dynamics=dynamics, policy=policy, match=match, cost=costs.of_particles(task.cost))
     return Workload(config, experiment, state, posterior, scenarios, value)
 

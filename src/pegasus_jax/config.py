@@ -21,6 +21,7 @@ OWN = (GYM, MJCF)
 
 SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
+MATCHINGS = ("always", "narrow", "never")
 COST_ESTIMATORS = ("gaussian", "particles")
 OBSERVATION_NOISES = ("model", "plant")
 INITS = ("previous", "better", "fresh")
@@ -138,7 +139,9 @@ class Search:
     learning_rate: float = setting(1e-3, "Adam's step size")
     decay: float = setting(1.0, "step size at the end of a search, as a fraction of that at its start")
     grad_clip: float | None = setting(1.0, "largest global norm of the gradient; null: no clipping")
-    moment_matching: bool = setting(True, "moment matching")
+    matching: str = setting(
+        "always", "moment matching: always; narrow: where no angle spreads over more than 1 rad; or never"
+    )
     standardized_noise: bool = setting(
         False, "make the drawn noise exactly zero mean, unit covariance over the particles"
     )
@@ -170,6 +173,7 @@ class Search:
     observation_noise: str = setting(
         "model", "whose noise is on what the policy sees: the model's prediction, or the plant's, where it is known"
     )
+    visited_starts: float = setting(0.0, "share of the imagined rollouts that start where the plant has been")
     policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
     period: Period = Period()
@@ -182,8 +186,9 @@ class Search:
         checks.sizes("search", self, "steps", "anneal_trials", "num_starts")
         checks.sizes("search", self, "particles", low=2)
         checks.check_range("search.learning_rate", self.learning_rate, 0, open_low=True)
-        for name in ("decay", "warm_restart", "refine_fraction"):
+        for name in ("decay", "warm_restart", "refine_fraction", "visited_starts"):
             checks.check_range(f"search.{name}", getattr(self, name), 0, 1)
+        checks.choice("search.matching", self.matching, MATCHINGS)
         checks.choice("search.cost_estimator", self.cost_estimator, COST_ESTIMATORS)
         checks.choice("search.observation_noise", self.observation_noise, OBSERVATION_NOISES)
         checks.choice("search.init", self.init, INITS)
@@ -221,7 +226,8 @@ class Analytic:
     init: str = setting("better", "what a search starts from: the previous policy, or the better of it and a fresh one")
     policy_noise: float = setting(1.0, "factor of the model's noise on what the policy sees")
     state_noise: float = setting(1.0, "factor of the model's noise added to the state")
-    reset_optimizer, anneal_trials, observation_noise = True, 1, "model"  # no settings: curvature is of one model
+    # No settings: curvature is of one model, and one Gaussian starts.
+    reset_optimizer, anneal_trials, observation_noise, visited_starts = True, 1, "model", 0.0
 
     def __post_init__(self) -> None:
         checks.typed("search", self)

@@ -12,6 +12,7 @@ from pegasus_jax.assembly.pieces import dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import limits, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
+from pegasus_jax.imagine.visited import remembering
 from pegasus_jax.sharding import over_particles
 from pegasus_jax.types import Array, Cost, Dynamics, Fitter, Policy, Searcher, Task
 
@@ -44,6 +45,8 @@ def compose(
     """
     task = task._replace(cost=as_cost(task.cost if cost is None else cost))
     dynamics = dynamics or dynamics_of(config.model, task)
+    if config.search.visited_starts and searcher is None:
+        dynamics = remembering(dynamics)
     policy = policy or policy_of(config.policy, task)
     configured, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)

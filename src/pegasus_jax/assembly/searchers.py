@@ -15,6 +15,7 @@ from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching, scenarios
 from pegasus_jax.imagine.objective import either, objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
+from pegasus_jax.imagine.visited import or_visited
 from pegasus_jax.learn.multistart import best_of
 from pegasus_jax.learn.schedule import SearchTable, search_table
 from pegasus_jax.learn.search import Problem, searcher
@@ -22,6 +23,13 @@ from pegasus_jax.pilco import search as pilco
 from pegasus_jax.policies.scaled import inherited
 from pegasus_jax.sharding import Spread, together
 from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, Rollout, Scenarios, Searcher, Task
+
+# What search.matching names, for a task's angles.
+MATCHES: dict[str, Callable[[tuple[int, ...]], matching.Match]] = {
+    "always": lambda _: matching.match,
+    "narrow": matching.narrow,
+    "never": lambda _: matching.keep,
+}
 
 # (key, policy parameters, posterior) -> (rollout, cost [H, K])
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]
@@ -34,23 +42,31 @@ def search_of(
     policy: Policy,
     spread: Spread = together,
 ) -> tuple[Searcher, Imagine]:
-    """The configured way of improving a policy, and fresh imagined rollouts of the same kind."""
+    """The configured way of improving a policy, and fresh imagined rollouts of the same kind, from the task's starts.
+
+    With `search.visited_starts` the posterior of `dynamics` is a `Visited`.
+    """
     known = tasks.known_sensors(task) if search.observation_noise == "plant" else None
     noise = NoiseUse(search.policy_noise, search.state_noise, known)
     if isinstance(search, settings.Analytic):
         return analytic_search_of(search, task, dynamics, policy, noise)
-    if (search.moment_matching or search.standardized_noise) and search.particles <= len(task.state_names):
-        states, what = len(task.state_names), "moment matching" if search.moment_matching else "standardized noise"
+    matches = search.matching != "never"
+    if (matches or search.standardized_noise) and search.particles <= len(task.state_names):
+        states, what = len(task.state_names), "moment matching" if matches else "standardized noise"
         raise ConfigError(
             f"search.particles={search.particles} is too few: {what} of {states} dimensions needs at least {states + 1}"
         )
     blocks = blocks_of(
         search.particles, task, dynamics, policy, standardized_noise=search.standardized_noise, spread=spread
     )
+    around = jnp.asarray(task.start_mean, float)
+    started = (
+        or_visited(blocks.start, search.visited_starts, task.angles, around) if search.visited_starts else blocks.start
+    )
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
     # A particle's cost is 1 / K of the objective.
     limit = None if (most := search.particle_grad_limit) is None else most / search.particles
-    match = matching.match if search.moment_matching else matching.keep
+    match = MATCHES[search.matching](task.angles)
     costs = costs_of(search, task)
     table = table_of(search)
     # What no row asks for is not compiled.
@@ -70,7 +86,7 @@ def search_of(
 
     clip = optax.identity() if search.grad_clip is None else optax.clip_by_global_norm(search.grad_clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
-    draws = scenarios.sampler(blocks, Period(**vars(search.period)))
+    draws = scenarios.sampler(blocks._replace(start=started), Period(**vars(search.period)))
     found = searcher(Problem(value, draws, optimizer, table, search.reset_optimizer))
     if search.num_starts > 1:
         lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
@@ -156,7 +172,8 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
         each = cost.of_particles(now)
         if search.cost_estimator != "gaussian":
             return until_stop(task, each)
-        return until_stop(task, either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), cost.of_matched(now)))
+        matched = cost.of_narrow(now, task.angles) if search.matching == "narrow" else cost.of_matched(now)
+        return until_stop(task, either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), matched))
 
     return costs
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pegasus_jax.imagine.matching import wide
 from pegasus_jax.math.gaussian import saturating_cost, sincos
 from pegasus_jax.math.linalg import cholesky, mean_and_cov
 from pegasus_jax.shapes import check_shape
@@ -17,6 +18,7 @@ __all__ = [
     "expected_by_nodes",
     "mean",
     "of_matched",
+    "of_narrow",
     "of_particles",
     "saturating",
     "total",
@@ -122,6 +124,12 @@ def of_matched(cost: Cost) -> Callable[[Array], Array]:
     """The expected cost of the Gaussian with the particles' mean and covariance: x [H, K, D] -> [H, 1]."""
     expected = expectation(cost)
     return jax.vmap(lambda x: expected(*mean_and_cov(x))[None])
+
+
+def of_narrow(cost: Cost, angles: tuple[int, ...]) -> Callable[[Array], Array]:
+    """`of_matched`, and at the times at which the particles are `matching.wide` the mean of their own costs."""
+    each, matched = of_particles(cost), of_matched(cost)
+    return lambda x: jnp.where(wide(x, angles)[:, None], jnp.mean(each(x), 1, keepdims=True), matched(x))
 
 
 def mean(costs: Array) -> Array:

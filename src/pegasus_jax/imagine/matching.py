@@ -1,9 +1,20 @@
 """Moment matching: replacing particles by fresh ones from the Gaussian with their mean and covariance."""
 
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
 from pegasus_jax.math.linalg import cholesky, mean_and_cov
 from pegasus_jax.types import Array
 
-__all__ = ["keep", "match"]
+__all__ = ["Match", "keep", "match", "narrow", "wide"]
+
+Match = Callable[[Array, Array], Array]
+
+# [rad] Particles that are spread evenly over half a circle have a standard deviation of .91, over all of it 1.81.
+WIDEST = 1.0
 
 
 def match(x: Array, z: Array) -> Array:
@@ -19,3 +30,18 @@ def keep(x: Array, z: Array) -> Array:
     """No moment matching: every particle goes on along its own trajectory."""
     del z
     return x
+
+
+def narrow(angles: tuple[int, ...]) -> Match:
+    """`match` while the particles are close together, and `keep` at the times at which they are `wide`.
+
+    Particles all around a circle are no Gaussian: one of the same moments forgets which of them swings which way, and
+    what a policy does to them averages out.
+    """
+    return lambda x, z: jnp.where(wide(x, angles), x, match(x, z))
+
+
+def wide(x: Array, angles: tuple[int, ...]) -> Array:
+    """Whether one of the angles of particles x [..., K, D] has a standard deviation of more than 1 rad -> [...]."""
+    turns = jax.lax.stop_gradient(x)[..., np.array(angles, int)]
+    return jnp.any(jnp.std(turns, -2) > WIDEST, -1)

@@ -44,6 +44,8 @@ REMOVED = {
     "search.cost_noise": Removed(0.0, "search.state_noise= is noise on the state itself, which the cost sees"),
 }
 
+MATCHING = {False: "never", True: "always"}
+
 RENAMED = {
     "precision": Renamed("x64", {"single": False, "double": True}),
     "evaluation": Renamed("eval_episodes"),
@@ -55,7 +57,8 @@ RENAMED = {
     "fit.batch": Renamed("fit.batch_size"),
     "fit.starts": Renamed("fit.num_starts"),
     "search.clip": Renamed("search.grad_clip"),
-    "search.match": Renamed("search.moment_matching"),
+    "search.match": Renamed("search.matching", MATCHING),
+    "search.moment_matching": Renamed("search.matching", MATCHING),
     "search.balanced": Renamed("search.standardized_noise"),
     "search.cost": Renamed("search.cost_estimator", {"matched": "gaussian"}),
     "search.refine": Renamed("search.refine_fraction"),

@@ -1,0 +1,89 @@
+"""Imagined rollouts that start where the plant has been."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.imagine.visited import STATES, Visited, or_visited, remembering
+from pegasus_jax.models.ensemble import ensemble
+from pegasus_jax.types import Dataset
+from pegasus_jax.vectorized import for_particles
+from probes import cart, experience, network, regression, same, tiny
+
+K, D = 2000, 3
+
+
+def rows(size, capacity=700):
+    """A data set whose row i is at i, beyond `size` at infinity."""
+    x = jnp.where(jnp.arange(capacity) < size, jnp.arange(capacity, dtype=jnp.float32), jnp.inf)[:, None] * jnp.ones(D)
+    return Dataset(x, x[:, :1], x, jnp.int32(size))
+
+
+def drawn(share, states, angles=(), around=0.0):
+    start = or_visited(lambda key, given: jnp.full((K, D), -5.0), share, angles, jnp.full(D, around))
+    return np.asarray(start(jax.random.key(0), Visited(None, states)))
+
+
+@pytest.mark.parametrize("size", [1, 7, STATES, 600])
+def test_the_states_are_the_rows_in_use_evenly(size):
+    kept = np.asarray(remembering(network()._replace(posterior=lambda *_: None)).posterior(None, rows(size)).states)
+    assert kept.shape == (STATES, D)
+    places, counts = np.unique(kept[:, 0], return_counts=True)
+    assert len(places) == min(size, STATES)
+    assert set(places) <= set(range(size))
+    assert counts.max() - counts.min() <= 1
+    assert places[0] == 0
+    assert places[-1] >= size - 1 - size // STATES
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 1.0])
+def test_so_large_a_share_starts_there(share):
+    """Four standard deviations of a binomial, and all states alike."""
+    x = drawn(share, jnp.arange(STATES, dtype=jnp.float32)[:, None] * jnp.ones(D))
+    there = x[:, 0] >= 0
+    assert abs(there.mean() - share) <= 4 * np.sqrt(share * (1 - share) / K)
+    assert np.array_equal(x[~there], np.full((int((~there).sum()), D), -5.0))
+    assert np.array_equal(x[there][:, 0], x[there][:, 2])  # whole states
+    if share == 1:
+        assert len(np.unique(x[:, 0])) > 0.9 * (1 - np.exp(-K / STATES)) * STATES
+
+
+def test_angles_are_those_near_the_starts_whatever_turns_the_plant_made():
+    turns = jnp.full((STATES, D), 0.5 + 6 * np.pi, jnp.float32)
+    x = drawn(1.0, turns, angles=(1,), around=np.pi)
+    np.testing.assert_allclose(x[:, 1], 0.5, atol=1e-4)
+    np.testing.assert_allclose(x[:, [0, 2]], 0.5 + 6 * np.pi, atol=1e-4)
+    np.testing.assert_allclose(drawn(1.0, turns, angles=(1,), around=-np.pi)[:, 1], 0.5 - 2 * np.pi, atol=1e-4)
+
+
+@pytest.mark.parametrize("members", [1, 3])
+def test_a_model_that_remembers_predicts_as_before(members):
+    model = network() if members == 1 else ensemble(network(), members)
+    data = experience()
+
+    @partial(jax.jit, static_argnums=0)
+    def predicted(one):
+        posterior = one.posterior(model.init(jax.random.key(1)), data)
+        keys = jax.random.split(jax.random.key(2), 6)
+        draws = jax.vmap(one.sample, (0, None))(keys, posterior) if one.deal is None else one.deal(keys, posterior)
+        alone = one.apply(posterior, jax.tree.map(lambda leaf: leaf[0], draws), data.x[0], data.u[0])
+        return for_particles(one.apply)(posterior, draws, data.x[:6], data.u[:6]), alone
+
+    assert same(predicted(model), predicted(remembering(model)))
+
+
+def test_a_search_starts_there_and_what_is_imagined_afterwards_does_not():
+    task, found = cart(), []
+    for share in (0.0, 1.0):
+        config = tiny(search__visited_starts=share, search__steps=3, fit__steps=2)
+        exp = compose(config, task, dynamics=regression(len(task.state_names), len(task.control_names)))
+        state = exp.init(jax.random.key(0))
+        state = jax.jit(exp.improve)(exp.add_episode(state, jax.jit(exp.collect)(state)))[0]
+        found.append((state.policy.params, jax.jit(exp.imagine)(state)[0].x[0]))
+    (own, own_starts), (other, starts) = found
+    assert not same(own, other)
+    assert same(own_starts, starts)
