@@ -11,10 +11,12 @@ import numpy as np
 import pytest
 
 import pegasus_envs  # noqa: F401 (registers the cart-pole)
+from benchmarks.plants_suite import batched
 from benchmarks.plants_suite.__main__ import main, share, table
 from benchmarks.plants_suite.native import returns
 from benchmarks.plants_suite.plants import PLANTS
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import user_code
 
 
@@ -99,3 +101,26 @@ def test_one_seed_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert len(row["returns"]) == 10
     assert row["plant_seconds"] == pytest.approx(2)
     assert "Pendulum-v1" in capsys.readouterr().out
+
+
+AWAY = {  # for each plant of joints: a goal, and what is far from it
+    "pendulum": ([0.0, 0.0], [np.pi, 0.0]),
+    "inverted_pendulum": ([0.0] * 4, [0.0, 0.3, 0.0, 0.0]),
+    "inverted_double_pendulum": ([0.0] * 6, [0.0, 1.5, 0.0, 0.0, 0.0, 0.0]),
+    "reacher": ([0.0, 0.0, 0.21, 0.0, 0.0, 0.0], [0.0, 0.0, -0.1, 0.2, 0.0, 0.0]),
+}
+
+
+@pytest.mark.parametrize("name", [*batched.PLANTS])
+def test_a_plant_of_joints_is_one_to_study(name: str) -> None:
+    """Its words make a task of an MJCF file, whose cost tells the goal from what is far, where its episodes end."""
+    config = config_io.parse(config_io.split(["task=mjcf", *batched.PLANTS[name]], ())[1])
+    assert Path(config.mjcf or "").exists()
+    cost = user_code.load("cost", config.cost or "")
+    goal, far = (jnp.array(x) for x in AWAY[name])
+    assert float(cost(goal)) < 1e-5
+    assert float(cost(far)) > 0.8
+    if config.stop:
+        stop = user_code.load("stop", config.stop)
+        assert float(stop(goal)) < 0.01
+        assert float(stop(far)) > 0.99

@@ -1,0 +1,69 @@
+"""The suite's plants as MJCF tasks, so that all seeds of one are learned as one program: quick on a GPU.
+
+    python -m benchmarks.plants_suite.batched PLANT NAME seeds=100-119 [trials=12] [setting=value ...]
+
+Writes and prints what benchmarks.study does. States are the joints' positions and rates, so that this says how well
+models and searches do, and nothing of what a state is; the suite itself (__main__.py) judges by native returns.
+"""
+
+import sys
+from pathlib import Path
+
+import gymnasium
+
+from benchmarks import study
+from pegasus_jax.checks import did_you_mean
+
+ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
+COSTS = "benchmarks.plants_suite.costs_of_joints"
+PLANTS: dict[str, tuple[str, ...]] = {
+    "pendulum": (
+        f"mjcf={Path(__file__).with_name('pendulum.xml')}",
+        f"cost={COSTS}:pendulum",
+        "dt=0.05",
+        "horizon=40",
+        "angles=[0]",
+        "start_mean=[3.14159,0]",
+        "start_std=[1.8,0.6]",
+    ),
+    "inverted_pendulum": (
+        f"mjcf={ASSETS}/inverted_pendulum.xml",
+        f"cost={COSTS}:inverted_pendulum",
+        f"stop={COSTS}:inverted_pendulum_falls",
+        "dt=0.04",
+        "horizon=50",
+        "angles=[1]",
+        "start_std=[0.006]",
+    ),
+    "inverted_double_pendulum": (
+        f"mjcf={ASSETS}/inverted_double_pendulum.xml",
+        f"cost={COSTS}:double_pendulum",
+        f"stop={COSTS}:double_pendulum_falls",
+        "dt=0.05",
+        "horizon=40",
+        "angles=[1,2]",
+        "start_std=[0.06,0.06,0.06,0.1,0.1,0.1]",
+    ),
+    "reacher": (
+        f"mjcf={ASSETS}/reacher.xml",
+        f"cost={COSTS}:reacher",
+        "dt=0.02",
+        "horizon=50",
+        "angles=[0,1]",
+        "observe=[qpos.0,qpos.1,qpos.2,qpos.3,qvel.0,qvel.1]",
+        "start_mean=[0,0,0,0,0,0]",
+        "start_std=[0.06,0.06,0.1,0.1,0.003,0.003]",
+    ),
+}
+
+
+def main(words: list[str]) -> None:
+    """The command line of this module."""
+    plant, *rest = words
+    if plant not in PLANTS:
+        sys.exit(f"{plant} is unknown; {did_you_mean(plant, PLANTS)}")
+    study.main([rest[0], "task=mjcf", *PLANTS[plant], *rest[1:]], f"benchmarks.plants_suite.batched {plant}")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
