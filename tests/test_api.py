@@ -158,9 +158,9 @@ def _() -> Any:
     return state.data, info.evaluation, state.policy.params
 
 
-@example("controller", "export")
+@example("controller", "export", "train")
 def _() -> Any:
-    raise AssertionError("needs a run's folder: see below")
+    raise AssertionError("needs a run's folder: see below, and test_start.py")
 
 
 def test_a_controller_of_a_run(tmp_path: Any) -> None:
@@ -343,7 +343,7 @@ PUBLIC = public()
 FUNCTIONS = {name: value for name, value in PUBLIC.items() if inspect.isfunction(inspect.unwrap(value))}
 
 
-@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - {"controller", "export"}))
+@pytest.mark.parametrize("name", sorted(FUNCTIONS.keys() - {"controller", "export", "train"}))
 def test_an_exported_function_is_called_with_exported_names(name: str) -> None:
     assert name in EXAMPLES, f"{name} is exported and has no example here"
     found = EXAMPLES[name]() if name in IMPURE else _jitted(EXAMPLES[name])

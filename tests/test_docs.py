@@ -157,7 +157,8 @@ def test_what_is_not_run_is_documented_and_there(command: str, tools: dict[str, 
 
 
 @pytest.mark.parametrize("program", PROGRAMS)
-def test_example_runs(program: str) -> None:
+def test_example_runs(program: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
     with jax.debug_key_reuse(False):  # vmap of a scan over split keys is its one false alarm (conftest.py)
         exec(compile(program, "example", "exec"), {"__name__": "example"})
 

@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from pegasus_jax.policies.linear import linear
     from pegasus_jax.policies.mlp import mlp
     from pegasus_jax.policies.wrap import of_pair
-    from pegasus_jax.presets import preset
     from pegasus_jax.runs.controller import Controller, controller
+    from pegasus_jax.runs.start import preset, train
     from pegasus_jax.types import (
         Batch,
         Cost,
@@ -62,7 +62,7 @@ if TYPE_CHECKING:
 _NAMES = {
     # a run, from settings
     "config": "Config",
-    "presets": "preset",
+    "runs.start": "preset train",
     "assembly.experiments": "build compose",
     "assembly.pieces": "dynamics_of policy_of",
     "experiment": "run trial Experiment Successor TrialInfo",
@@ -176,6 +176,7 @@ __all__ = [
     "searcher",
     "ssgp",
     "tasks",
+    "train",
     "trial",
 ]
 

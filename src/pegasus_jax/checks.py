@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import math
 import numbers
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from types import GenericAlias, UnionType
 from typing import Any, get_args
@@ -159,6 +159,9 @@ def _as(kind: Any, value: Any) -> Any:
     raise TypeError(f"{value!r} is not {called(kind)}")
 
 
+FUNCTION = str | Callable | None  # of a setting that names a function, or from Python is one
+
+
 def called(kind: Any) -> str:
     """A setting's type in words."""
     return {
@@ -172,6 +175,7 @@ def called(kind: Any) -> str:
         tuple[tuple[int, ...], ...] | None: "a list of pairs of whole numbers or null",
         tuple[tuple[float, ...], ...]: "a list of lists of numbers",
         str | None: "a word or null",
+        FUNCTION: "a word or null",
         int | None: "a whole number or null",
         float | None: "a number or null",
     }.get(kind, "one of its kinds")
@@ -185,6 +189,8 @@ def shown(value: Any) -> str:
         return str(value).lower()
     if isinstance(value, tuple | list):
         return "[" + ",".join(map(shown, value)) + "]"
+    if callable(value):
+        return f"{value.__module__}:{value.__qualname__}"
     words = f"{value:g}" if isinstance(value, float) else str(value)
     return words if words.isprintable() else repr(words)
 

@@ -4,6 +4,7 @@ Values are checked when a config is made; a bad one raises `ConfigError`, which 
 """
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
@@ -275,7 +276,7 @@ class Config:
     legs: int = setting(2, "that the swimmer drives: 2 or 6", ("swimmer_*",))
     env: str | None = setting(None, "the environment's Gymnasium id", (GYM,))
     mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", (MJCF,))
-    cost: str | None = setting(None, "module:function, observation [D] -> cost in [0, 1], in JAX", OWN)
+    cost: str | Callable | None = setting(None, "module:function, observation [D] -> cost in [0, 1], in JAX", OWN)  # noqa: RUF009 (frozen)
     angles: tuple[int, ...] = setting((), "the entries of the observation that are angles [rad]", OWN)
     rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", (GYM,))
     circles: tuple[tuple[int, ...], ...] | None = setting(
@@ -288,7 +289,7 @@ class Config:
     env_args: tuple[str, ...] = setting(
         (), "the environment's own arguments, each as env_args.port=/dev/ttyACM0", (GYM,)
     )
-    stop: str | None = setting(
+    stop: str | Callable | None = setting(  # noqa: RUF009 (frozen)
         None, "module:function, observation [D] -> probability that an episode ends there, in JAX", OWN
     )
     stop_cost: float = setting(1.0, "of each control period that an early end leaves out", OWN)

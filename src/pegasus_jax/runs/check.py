@@ -36,7 +36,7 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
         task.success,
         task.circles,
     )
-    notes = cost_check.notes(task.cost.of_state, facts, f"cost={config.cost}")
+    notes = cost_check.notes(task.cost.of_state, facts, f"cost={shown(config.cost)}")
     stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)
@@ -56,7 +56,7 @@ def stopping(config: Config, task: Task) -> None:
     """Raises ConfigError unless the task's `stop` is one probability, and its episodes do not end where they start."""
     if task.stop is None:
         return
-    what = f"stop={config.stop}"
+    what = f"stop={shown(config.stop)}"
     with user_code.blamed(what, task.stop):
         value = jnp.asarray(task.stop(jnp.asarray(task.start_mean, float)))
     if value.shape != ():

@@ -2,7 +2,7 @@
 
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from pegasus_jax.checks import ConfigError, called, did_you_mean, shown
+from pegasus_jax.checks import FUNCTION, ConfigError, called, did_you_mean, shown
 from pegasus_jax.config import KINDS, TASKS, Config, uses
 from pegasus_jax.presets import WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
@@ -37,8 +37,11 @@ def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, 
     return known, rest
 
 
-def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
-    """The config of a command line: a preset, the sections that words replace, then the dotted settings."""
+def parse(words: Mapping[str, Any], options: Sequence[str] = ()) -> Config:
+    """The config of a command line: a preset, the sections that words replace, then the dotted settings.
+
+    The words are texts, from Python maybe values.
+    """
     words = _with_arguments(words)
     chosen = {name: words.pop(name) for name in NAMED if name in words}
     for name, value in chosen.items():
@@ -52,20 +55,27 @@ def parse(words: dict[str, str], options: Sequence[str] = ()) -> Config:
     config = preset(begin, **chosen)
     if task not in (None, config.task):
         raise ConfigError(f"preset={begin} is for task={config.task}, not task={task}; the nearest is preset={task}")
-    known, of_some = leaves(config), used_by()
+    known = leaves(config)
     for key in words:
         refuse(key)
         if key not in known:
             raise ConfigError(f"{key} is not a setting; {_hint(key, [*known, *NAMED, *options])}")
-        if config.task not in of_some.get(key, (config.task,)):
-            raise ConfigError(
-                f"{key}={shown(words[key])} is of no use with task={config.task}; the nearest task that uses it is"
-                f" task={_nearest_of(config.task, of_some[key])}"
-            )
+        check_used(config.task, {key: words[key]})
     changed = override(config, values(words))
     if changed.legs != config.legs:
         raise ConfigError(f"preset={begin} is for legs={config.legs}; with legs={changed.legs} leave out preset=")
     return changed
+
+
+def check_used(task: str, given: Mapping[str, Any]) -> None:
+    """Raises ConfigError for a setting of a plant's own that is of no use with this task."""
+    of_some = used_by()
+    for key, value in given.items():
+        if task not in of_some.get(key, (task,)):
+            raise ConfigError(
+                f"{key}={shown(value)} is of no use with task={task}; the nearest task that uses it is"
+                f" task={_nearest_of(task, of_some[key])}"
+            )
 
 
 def used_by() -> dict[str, tuple[str, ...]]:
@@ -78,7 +88,7 @@ def _nearest_of(task: str, choices: Sequence[str]) -> str:
     return (get_close_matches(task, choices, n=1) or [choices[0]])[0]
 
 
-def _with_arguments(words: dict[str, str]) -> dict[str, str]:
+def _with_arguments(words: Mapping[str, Any]) -> dict[str, Any]:
     """The words, with those of env_args.NAME=VALUE as one list."""
     prefix = "env_args."
     given = [f"{key.removeprefix(prefix)}={value}" for key, value in words.items() if key.startswith(prefix)]
@@ -86,9 +96,9 @@ def _with_arguments(words: dict[str, str]) -> dict[str, str]:
     return rest | ({"env_args": json.dumps(given)} if given else {})
 
 
-def values(words: dict[str, str]) -> dict[str, Any]:
-    """What the texts on the right of `key=` mean, read as YAML."""
-    return {key: _value(key, text) for key, text in words.items()}
+def values(words: Mapping[str, Any]) -> dict[str, Any]:
+    """What the texts on the right of `key=` mean, read as YAML; what is no text is a value already."""
+    return {key: _value(key, text) if isinstance(text, str) else text for key, text in words.items()}
 
 
 def override(config: Config, changes: dict[str, Any]) -> Config:
@@ -114,8 +124,11 @@ def leaves(node: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def plain(config: Config) -> dict[str, Any]:
-    """`leaves` as YAML and JSON have them: with lists, not tuples."""
-    return {name: list(value) if isinstance(value, tuple) else value for name, value in leaves(config).items()}
+    """`leaves` as YAML and JSON have them: with lists, not tuples, and a function by its name."""
+    return {
+        name: list(value) if isinstance(value, tuple) else shown(value) if callable(value) else value
+        for name, value in leaves(config).items()
+    }
 
 
 def help_lines(node: Any, prefix: str = "") -> list[str]:
@@ -207,7 +220,10 @@ def _converted(node: Any, name: str, value: Any, key: str) -> Any:
         raise ConfigError(f"{key}={shown(value)} is not a value but a reference to one; write the value itself")
     current = getattr(node, name)
     field = next(f for f in dataclasses.fields(node) if f.name == name)
-    schema = OmegaConf.structured(dataclasses.make_dataclass("One", [(name, field.type, current)]))
+    if callable(value):
+        return value  # from Python: the config says whether it can be one
+    kind, default = (str | None, None) if field.type == FUNCTION else (field.type, current)  # in words, its name
+    schema = OmegaConf.structured(dataclasses.make_dataclass("One", [(name, kind, default)]))
     try:
         merged = OmegaConf.merge(schema, {name: value})
         assert isinstance(merged, DictConfig)

@@ -195,7 +195,7 @@ def announce(run: Path, config: Config) -> None:
     """Say which modules of their user a config names, and where they are. Raises RunError for one inside the run."""
     inside = run.resolve()
     names = (config.cost, config.env if ":" in (config.env or "") else None)
-    modules = sorted({name.partition(":")[0] for name in names if name})
+    modules = sorted({name.partition(":")[0] for name in names if isinstance(name, str)})
     for entry in (os.getcwd(), *sys.path) if modules else ():
         if Path(entry or ".").resolve().is_relative_to(inside):
             raise RunError(f"{entry or os.getcwd()} lies in {run}, and nothing is imported from there; go elsewhere")

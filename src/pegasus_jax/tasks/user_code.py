@@ -22,14 +22,21 @@ LIBRARIES = {"jax", "jaxlib", "numpy", "gymnasium", "flax", "optax", "pegasus_ja
 LONGEST = 300  # characters of somebody else's message
 
 
-def load(setting: str, name: str, not_from: Path | None = None) -> Callable[..., Any]:
-    """The function `module:function` that a setting names, also of a module in the working folder.
+def load(setting: str, name: str | Callable[..., Any], not_from: Path | None = None) -> Callable[..., Any]:
+    """The function `module:function` that a setting names, also of a module in the working folder; or is, from Python.
 
     Raises ConfigError, in one line with the user's file and line, where it cannot be had; with `not_from`, a run's
     folder, also where the module lies in it: looking at a run must not run what came with it.
     """
+    if not isinstance(name, str):
+        return name
     module, _, function = name.partition(":")
     what = f"{setting}={name}"
+    if module == "__main__" or "<" in function:
+        raise ConfigError(
+            f"{what} is a function of the Python program that began the run, which no other can import; define it in a"
+            " module of its own, or go on in Python: train(resume=RUN, cost=function)"
+        )
     if not (module and function):
         raise ConfigError(f"{what} cannot be imported: expected {setting}=module:function, as in {setting}=robot:cost")
     found = importing(what, module, not_from)

@@ -1,0 +1,211 @@
+"""How a run begins, by a command or from Python: its folder, the checks before it, the loop, and what is said of it.
+
+A command speaks before JAX is there, so whatever imports JAX is imported where it is needed.
+"""
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pegasus_jax.checks import SIZES, ConfigError, check_range
+from pegasus_jax.config import Config, label
+
+Mesh = Any  # a jax.sharding.Mesh; None: one device
+
+
+class Asked(NamedTuple):
+    """What a command line, or a call, asks for."""
+
+    config: Config
+    home: Path  # the run's folder, or that of the runs of many seeds
+    runs: dict[int, Path]  # seed -> folder
+    resumed: Path | None = None  # of a run that goes on, its folder, or the first one's
+    mjcf: str | None = None  # where the file of a run that goes on is now
+    final: bool = False  # whether the last policy runs once more
+
+
+def preset(
+    name: str = "cartpole",
+    *,
+    model: str | None = None,
+    policy: str | None = None,
+    algorithm: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+) -> Config:
+    """The config of a command with these words: preset("cartpole") is that of `pegasus-train task=cartpole`.
+
+    `model`, `policy` and `algorithm` are the command's words. `settings` are its other ones, by name, each with its
+    text or its value: {"search.steps": 200, "explore.kind": "walk"}. Raises ConfigError as the command would, in one
+    line with the nearest choice.
+    """
+    from pegasus_jax.runs import config_io
+
+    said = {"preset": name, "model": model, "policy": policy, "algorithm": algorithm}
+    return config_io.parse({word: value for word, value in said.items() if value is not None} | dict(settings or {}))
+
+
+def train(
+    config: Config | str | None = None,
+    *,
+    out: str | Path | None = None,
+    resume: str | Path | None = None,
+    settings: Mapping[str, Any] | None = None,
+    cost: Callable[[Any], Any] | None = None,
+    seeds: int = 1,
+    final: bool = False,
+    mesh: Mesh = None,
+) -> Path:
+    """Learn what `pegasus-train` would, by the same loop and with the same files; returns the run's folder.
+
+    config: of a new run, or the name of a preset; None: "cartpole"
+    out: the folder of a new run, or of those of many seeds; None: a free one in runs/
+    resume: the folder of a run that goes on, instead of config and out
+    settings: by name, as for `preset`; of a run that goes on those that may change
+    cost: of a gym's or an mjcf's task a function of one observation, instead of the setting cost="module:function"
+    seeds: so many, from config.seed on, as one program
+    final: whether the last policy runs for one more episode
+    mesh: the devices that share seeds and particles (sharding.py); None: as many as share the seeds evenly
+
+    Raises ConfigError for what cannot be, and RunError where a run cannot go on. JAX has the config's precision while
+    it runs; its devices are the caller's.
+    """
+    given = dict(settings or {}) | ({} if cost is None else {"cost": cost})
+    if resume is None:
+        asked = new(_config_of(config, given), out, seeds)
+    elif config is None and out is None:
+        asked = going_on(Path(resume), given)
+    else:
+        raise ConfigError(f"resume={resume} goes on with a run; leave out config and out")
+    with _precision_kept():
+        start(asked._replace(final=final), "pegasus_jax.train", lambda: mesh or _evenly(len(asked.runs)))
+    return asked.home
+
+
+def _config_of(config: Config | str | None, given: dict[str, Any]) -> Config:
+    from pegasus_jax.runs import config_io
+
+    if isinstance(config, Config):
+        config_io.check_used(config.task, given)
+        return config_io.override(config, config_io.values(given))
+    return preset(config or "cartpole", settings=given)
+
+
+def new(config: Config, out: str | Path | None, seeds: int) -> Asked:
+    """A new run, or one of each of so many seeds, from config.seed on. Raises ConfigError for more than can be."""
+    from pegasus_jax.runs import store  # it imports NumPy, which a refused command does not wait for
+
+    _one_environment(config, seeds)
+    check_range("seeds", seeds, 1, SIZES["trials"])
+    name = f"seed{config.seed}" if seeds == 1 else f"seeds{config.seed}-{config.seed + seeds - 1}"
+    home = Path(out) if out is not None else store.free(Path(f"runs/{label(config)}-{name}"))
+    every = range(config.seed, config.seed + seeds)
+    return Asked(config, home, {config.seed: home} if seeds == 1 else {seed: home / f"seed{seed}" for seed in every})
+
+
+def going_on(home: Path, changes: dict[str, Any]) -> Asked:
+    """A run that goes on, or those of many seeds. Raises ConfigError for a setting with which it could not.
+
+    A function, which from Python takes the place of one that nobody else can import, is the caller's word.
+    """
+    from pegasus_jax.runs import config_io, store
+
+    if wrong := sorted(key for key, value in changes.items() if not (_changeable(key) or callable(value))):
+        raise ConfigError(
+            f"{wrong[0]} cannot be changed by resume=; only trials=, eval_episodes=, fit.*, search.* can, and mjcf= if"
+            " the file was moved"
+        )
+    runs = store.seeds_of(home)
+    first = store.existing(next(iter(runs.values()), home))
+    mjcf = changes.pop("mjcf", None)
+    config = config_io.override(config_io.load(first / "config.yaml"), config_io.values(changes))
+    config_io.check_used(config.task, changes)
+    _one_environment(config, len(runs))
+    return Asked(config, home, runs or {config.seed: home}, first, mjcf)
+
+
+def _changeable(key: str) -> bool:
+    """Whether a run can go on with another value of this setting: what it has learned stays what it is."""
+    return key in ("trials", "eval_episodes", "mjcf") or key.startswith(("fit.", "search."))
+
+
+def _one_environment(config: Config, seeds: int) -> None:
+    if seeds > 1 and config.env is not None:
+        raise ConfigError(f"seeds={seeds} is too many for task={config.task}, whose environment is one object; seeds=1")
+
+
+def start(asked: Asked, command: str, configure: Callable[[], Mesh]) -> None:
+    """Learn what is asked for, and say so. `configure` makes the mesh of devices, before any code of the user runs."""
+    from pegasus_jax.runs import display, store
+
+    done = None if asked.resumed is None else len(store.readable_trials(asked.resumed)[0])
+    print(display.announcement(asked.config, asked.home, len(asked.runs), done), flush=True)
+    mesh = configure()
+    from pegasus_jax.runs.programs import is_main_process
+    from pegasus_jax.runs.train import train_seeds
+
+    if is_main_process():
+        print(display.devices(), flush=True)
+    config = _checked(asked, mesh)
+    if asked.resumed is None and is_main_process():
+        if store.seeds_of(asked.home):
+            free = store.free(asked.home)
+            raise ConfigError(f"out={asked.home} holds runs already; resume={asked.home} goes on, out={free} is free")
+        for run in asked.runs.values():
+            store.create(run)
+    train_seeds(config, asked.runs, resume=asked.resumed is not None, command=command, final=asked.final, mesh=mesh)
+    if is_main_process():
+        _summed_up(asked)
+
+
+def _checked(asked: Asked, mesh: Mesh) -> Config:
+    """The config with all that is known of its task. Impossible settings end here, before anything is written."""
+    from pegasus_jax.assembly.experiments import build
+    from pegasus_jax.runs import restore
+    from pegasus_jax.runs.check import RESETS, before_training, circles_found
+    from pegasus_jax.tasks import resolve
+
+    if asked.resumed is not None:
+        config = restore.moved(asked.resumed, asked.config, asked.mjcf)
+        restore.announce(asked.resumed, config)
+        build(replace(config, seed=0), mesh)
+        return config
+    config = resolve(asked.config)
+    task = build(replace(config, seed=0), mesh).task
+    resets = 1 if asked.config.start_mean else RESETS  # who says where episodes start has nobody reset a robot
+    for note in circles_found(asked.config, config) + before_training(config, task, resets):
+        print(f"note: {note}", file=sys.stderr)
+    return config
+
+
+def _summed_up(asked: Asked) -> None:
+    """Say which policy is the best, and where it is."""
+    from pegasus_jax.runs import display, restore, store
+
+    for seed, run in asked.runs.items():
+        told = display.best_line(store.trials(run), restore.best(run))
+        print(f"seed {seed}: {told}" if len(asked.runs) > 1 else told)
+    home = asked.home
+    print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(asked.runs.values()))})")
+
+
+def _evenly(seeds: int) -> Mesh:
+    from pegasus_jax.sharding import evenly
+
+    return evenly(seeds)
+
+
+@contextmanager
+def _precision_kept() -> Iterator[None]:
+    """JAX's precision after the block is what it was before."""
+    import jax
+
+    names = ("jax_enable_x64", "jax_default_matmul_precision")
+    before = {name: getattr(jax.config, name) for name in names}
+    try:
+        yield
+    finally:
+        for name, value in before.items():
+            jax.config.update(name, value)
