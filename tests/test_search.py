@@ -289,6 +289,15 @@ def test_a_fresh_policy_that_a_table_needs_and_iterations_that_it_lacks_are_erro
         found.run(jax.random.key(0), learner, 1.0, steps=3, fresh=jnp.zeros(3))
 
 
+@pytest.mark.parametrize(("init", "asks"), [("previous", False), ("better", True), ("fresh", True)])
+def test_a_fresh_policy_that_no_row_asks_for_is_not_used(init, asks):
+    """So that a program need not draw it."""
+    found, learner = on_table(search_table(2, init=init), optax.sgd(0.1), STILL, rowless)
+    run = partial(found.run, jax.random.key(0), learner, 1.0, steps=2)
+    program = jax.make_jaxpr(lambda fresh: run(fresh=fresh))(jnp.zeros(3)).jaxpr
+    assert any(program.invars[0] is used for step in program.eqns for used in step.invars) == asks
+
+
 def test_one_program_serves_the_first_search_and_all_others():
     """The state has the types at its beginning that it has after a search: else each would compile again."""
     found, learner = on_table(search_table(2, refine=1), optax.adam(0.1), value=rowless)

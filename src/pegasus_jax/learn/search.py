@@ -63,7 +63,7 @@ def search(
     table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)
     if steps > (most := len(begin) - 1):
         raise ValueError(f"steps={steps}: the table of this search has {most}")
-    if fresh is None and FRESH in table.candidate:
+    if (asks := FRESH in table.candidate) and fresh is None:  # one that no row asks for is not drawn
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
     rows = of_search(table, earlier)
     following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
@@ -74,7 +74,7 @@ def search(
         learner, scenarios, info = loop
         now: SearchTable = jax.tree.map(lambda column: column[row + k], rows)
         (own, state), choose = learner, partial(jax.lax.select_n, now.candidate)
-        visited = jax.tree.map(choose, own, own if fresh is None else fresh, state.start, state.start)
+        visited = jax.tree.map(choose, own, fresh if asks else own, state.start, state.start)
         value, gradient = jax.value_and_grad(problem.objective)(visited, posterior, scenarios, now)
         learner, cost, skipped = after(now, learner, visited, value, gradient, problem)
         i = now.iteration - first

@@ -17,20 +17,23 @@ from pegasus_jax.tasks import user_code
 from pegasus_jax.types import RunState, Task, Trajectory
 
 
-def collected(job: Job, states: RunState, trial: int) -> list[Episode]:
+def collected(job: Job, states: RunState, trial: int) -> tuple[list[Episode], np.ndarray]:
     """The episodes [S] of a trial: those that the writer has as they are, the others run on the plant and handed to it.
 
+    And the trial [S] after which the policy was learned that runs in each; 0 for random controls.
     Raises RunError where one failed, after it was kept as far as it came, or is not made of finite numbers; and
     KeyboardInterrupt where a signal ended it.
     """
     task, known = job.experiment.task, job.writer.known(trial)
     missing = any(ran is None for ran in known)
+    learned = np.asarray(gather(states.policy_trial))
+    policies = np.zeros_like(learned) if job.random(trial) else learned
     last = job.config.trials  # the one more episode that a run may end with is shown as the end of its last trial
     job.display.phase(min(trial, last), "collect" if missing else "read", float(trial > last))
     if missing:
         # What was measured on an environment is stored before a signal is heard again.
         with interrupt.held() if task.environment is not None else nullcontext():
-            known = gathered(job, states, trial, known)
+            known = gathered(job, states, trial, known, policies)
     episodes = []
     for index, ran in enumerate(ran for ran in known if ran is not None):
         finite = bool(np.isfinite(ran.trajectory.cost).all())
@@ -39,27 +42,22 @@ def collected(job: Job, states: RunState, trial: int) -> list[Episode]:
         if not finite and task.environment is None and is_main_process():
             where = job.writer.where(index, trial)
             job.display.line(f"{where} has costs that are not finite; counted again from its observations")
-    return episodes
+    return episodes, policies
 
 
-def gathered(job: Job, states: RunState, trial: int, known: list[Episode | None]) -> list[Episode]:
+def gathered(
+    job: Job, states: RunState, trial: int, known: list[Episode | None], policies: np.ndarray
+) -> list[Episode]:
     """The known episodes, and for those that are not, ones that are run on the plant and handed to the writer."""
     task, random = job.experiment.task, job.random(trial)
     keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(gather(states.key))
     fresh = job.program.collect(keys, states.policy.params, random)
-    policies = policies_that_run(job, states, trial)
     for index, ran in enumerate(fresh):
         if known[index] is None:
             check_finite(job, ran.trajectory, trial)
             job.writer.episode(index, trial, ran, int(policies[index]))
             failed(ran, task, job.writer.advice(index))
     return [old if old is not None else new for old, new in zip(known, fresh, strict=True)]
-
-
-def policies_that_run(job: Job, states: RunState, trial: int) -> np.ndarray:
-    """The trial [S] after which the policy that runs in this trial's episode was learned; 0 for random controls."""
-    learned = np.asarray(gather(states.policy_trial))
-    return np.zeros_like(learned) if job.random(trial) else learned
 
 
 def check_finite(job: Job, trajectory: Trajectory, trial: int) -> None:

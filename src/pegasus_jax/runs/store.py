@@ -45,7 +45,6 @@ UNFINISHED = re.compile(
     r"\.\w{8}|\.play\.\w{8}|\d{4,}\.orbax-checkpoint-tmp.*"
 )
 ENDED = ("horizon", "terminated", "truncated", "error", "interrupted")  # how an episode can end
-CUT = ENDED[3:]  # of these, by what is no doing of the policy
 # What a row of trials.jsonl says in numbers, and readers of it use.
 COLUMNS = ("plant_seconds", "episode_cost", "mean_cost", "success_rate", "objective_last", "objective_fresh")
 
@@ -301,6 +300,8 @@ def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None =
     `last_episode` is one more than there are rows. What a fault or a person cut short does not count. A policy that
     never ran is chosen only where none ran: the last one. Among equals it is the latest.
     """
+    from pegasus_jax.episode import CUT
+
     if all(row["mean_cost"] is not None and row["success_rate"] is not None for row in rows):
         return max(rows, key=lambda row: (row["success_rate"], -row["mean_cost"], row["trial"]))["trial"]
     own: dict[int, list[tuple[float, float]]] = {}  # of each policy, (failed, cost) of its episodes

@@ -19,7 +19,7 @@ from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import EVALUATE, trial_key
 from pegasus_jax.runs import checkpoint, config_io, restore, store, writers
-from pegasus_jax.runs.collect import collected, policies_that_run, stacked
+from pegasus_jax.runs.collect import collected, stacked
 from pegasus_jax.runs.display import summary
 from pegasus_jax.runs.evaluation import evaluate, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
@@ -109,9 +109,8 @@ def learn(job: Job, states: RunState, done: int = 0) -> RunState:
 def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Row]]:
     """One round of Alg. 1 for every seed, then the evaluation; a row a seed says how it went."""
     config, task, program = job.config, job.experiment.task, job.program
-    random, policies = job.random(trial), policies_that_run(job, states, trial)
     # Line 3: run the policy on the plant.
-    episodes = collected(job, states, trial)
+    episodes, policies = collected(job, states, trial)
     trajectories = stacked(episodes, task)
     # Before this episode teaches the model, and after another has. No first trial should wait for the compiler.
     judged = trial > max(1, config.explore.trials)
@@ -129,7 +128,7 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Ro
         {
             "trial": trial,
             "plant_seconds": round(int(sizes[index]) * task.dt, 6),
-            "random": random,
+            "random": job.random(trial),
             "policy": int(policies[index]),
             **episode.verdict(ran, task),
             "steps": len(ran.trajectory.u),
