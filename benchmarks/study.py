@@ -11,7 +11,7 @@ import sys
 from benchmarks import RESULTS
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
-from pegasus_jax.runs.programs import share_processors
+from pegasus_jax.runs.programs import share_cpus
 from pegasus_jax.runs.study import seed_list, study, table, write
 
 
@@ -23,7 +23,7 @@ def main(words: list[str], module: str = "benchmarks.study") -> None:
     path = RESULTS / f"{name}.json"
     RESULTS.mkdir(exist_ok=True)
     seeds = seed_list(options.get("seeds", "0-9"))
-    share_processors(len(seeds))
+    share_cpus(len(seeds))
     result = study(config, seeds, path)
     result["about"] = about(shlex.join(["python", "-m", module, *words]))
     write(path, result)

@@ -106,7 +106,7 @@ def test_every_size_can_be_asked_for(name):
 def test_two_processors_of_one_name_are_told_apart(monkeypatch):
     for family, said in (("25", "AMD EPYC, family 25, model 17"), ("26", "AMD EPYC, family 26, model 17")):
         known = {"flags": "sse", "model": "17", "cpu family": family, "model name": "AMD EPYC"}
-        monkeypatch.setattr(machine, "processor", lambda known=known: known)
+        monkeypatch.setattr(machine, "cpu", lambda known=known: known)
         assert machine.about("")["processor"] == said
 
 

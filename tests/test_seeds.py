@@ -117,7 +117,7 @@ def test_how_it_is_compiled_changes_no_result() -> None:
 def test_the_cores_of_a_processor_share_the_seeds(study: Path) -> None:
     """Two of them for two seeds; on a machine of one there is nothing to share."""
     devices = json.loads((study / "seed1" / "run.json").read_text())["devices"]
-    assert len(devices) == min(2, machine.processors())
+    assert len(devices) == min(2, machine.cpus())
 
 
 @pytest.mark.parametrize(
@@ -127,14 +127,14 @@ def test_one_thread_imagines_few_particles(seeds: int, particles: int | None, th
     """As the system counts XLA's threads, in a process of its own; a machine of one CPU has one in any case."""
     code = f"""
 import pathlib, jax
-from pegasus_jax.runs.programs import share_processors
-share_processors({seeds}, {particles})
+from pegasus_jax.runs.programs import share_cpus
+share_cpus({seeds}, {particles})
 jax.block_until_ready(jax.jit(lambda: jax.numpy.ones(3))())
 print(sum("XLAEigen" in path.read_text() for path in pathlib.Path("/proc/self/task").glob("*/comm")))
 """
     environment = {k: v for k, v in os.environ.items() if k not in ("NPROC", "XLA_FLAGS", "JAX_NUM_CPU_DEVICES")}
     found = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert int(found.stdout) == (threads or machine.processors())
+    assert int(found.stdout) == (threads or machine.cpus())
 
 
 @pytest.mark.slow

@@ -40,7 +40,7 @@ def fingerprint(run: Path) -> str:
 def test_python_leaves_what_the_command_leaves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(programs, "share_processors", lambda *_: None)  # JAX has its devices by now
+    monkeypatch.setattr(programs, "share_cpus", lambda *_: None)  # JAX has its devices by now
     words = [f"{key}={config_io.shown(value)}" for key, value in TINY.items()]
     cli_train.train(["task=cartpole", "model=log_normal", "seed=3", *words, f"out={tmp_path / 'words'}"])
     said = capsys.readouterr().out

@@ -43,7 +43,7 @@ def compare(words: Sequence[str]) -> None:
     from benchmarks.paper import claims, comparison  # here: a refused command does not wait for JAX
     from benchmarks.paper.figures import read
     from pegasus_jax.runs import config_io
-    from pegasus_jax.runs.programs import share_processors
+    from pegasus_jax.runs.programs import share_cpus
     from pegasus_jax.runs.study import seed_list
 
     files = [word for word in words if "=" not in word]
@@ -53,7 +53,7 @@ def compare(words: Sequence[str]) -> None:
     asked: dict[str, Any] = dict(seeds=options.get("seeds", ""), changes=[f"{k}={v}" for k, v in changed.items()])
     only = [label for label in options.get("variants", "").split(",") if label]
     figure, out = read(Path(files[0])), Path(options.get("out", "runs/figures"))
-    share_processors(len(seed_list(asked["seeds"] or figure.seeds)))
+    share_cpus(len(seed_list(asked["seeds"] or figure.seeds)))
     command = shlex.join(["python", "-m", "benchmarks.paper", *words])
     there = comparison.run(figure, out, only=only, command=command, **asked)
     for line in comparison.differences(figure, there, **asked):

@@ -28,7 +28,7 @@ from pegasus_envs.physics import Motion
 from pegasus_envs.plant import Plant, simulate
 from pegasus_envs.swimmer.plant import HIPS, swimmer
 from pegasus_envs.swimmer.rotations import angles_of
-from pegasus_jax.runs.machine import about, processors
+from pegasus_jax.runs.machine import about, cpus
 
 SECONDS, SEEDS, TIMES = 20.0, 8, (0.5, 1, 2, 3, 5, 10, 20)
 BATCHES = (1, 10, 100)
@@ -162,7 +162,7 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    cores = processors()
+    cores = cpus()
     rows = {name: {"cost": cost(plant, drive(plant)), "strays": strays(plant, drive)}
             for name, (plant, drive) in PLANTS.items()}  # fmt: skip
     rows["cartpole"]["energy_drift"] = energy_drift(cartpole(friction=0.0))

@@ -60,7 +60,7 @@ def main(words: list[str]) -> None:
     """The command line of this module."""
     from benchmarks import RESULTS  # here: what this module imports, the measured process waits for
     from pegasus_jax.runs import config_io
-    from pegasus_jax.runs.machine import about, processors
+    from pegasus_jax.runs.machine import about, cpus
 
     options, rest = config_io.split(words, ("repeats",))
     train = [f"{key}={value}" for key, value in ({"task": "cartpole"} | rest).items()]
@@ -71,7 +71,7 @@ def main(words: list[str]) -> None:
                 runs.append(once(train, cache))
                 print(name, json.dumps({part: round(seconds, 2) for part, seconds in runs[-1].items()}), flush=True)
     result: dict[str, Any] = {name: min(runs, key=lambda run: run["total"]) for name, runs in rows.items()}
-    result |= {"runs": rows, "cpus": processors()}
+    result |= {"runs": rows, "cpus": cpus()}
     result["about"] = about(shlex.join(["python", "-m", "benchmarks.speed.first_step", *words]))
     RESULTS.mkdir(exist_ok=True)
     (RESULTS / "first_step.json").write_text(json.dumps(result, indent=1) + "\n")

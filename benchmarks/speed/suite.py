@@ -26,7 +26,7 @@ from benchmarks.speed.workloads import SIZES, Workload, flop, workload
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
-from pegasus_jax.runs.machine import about, processors
+from pegasus_jax.runs.machine import about, cpus
 
 STEPS, FIT_STEPS, PRODUCTS = 10, 100, 500  # steps, and products, in one timed run
 Row = dict[str, float]
@@ -168,7 +168,7 @@ def main(words: list[str]) -> None:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     print(table(rows))
     print(f"peak memory of the process {peak / 1e9:.2f} GB")
-    machine = {"cpus": processors()}
+    machine = {"cpus": cpus()}
     command = shlex.join(["python", "-m", "benchmarks.speed.suite", *words])
     result = {"rows": rows, "peak_memory_bytes": peak, "machine": machine, "about": about(command)}
     out = Path(options.get("out", RESULTS / "speed.json"))

@@ -56,12 +56,12 @@ def understood(words: Sequence[str]) -> tuple[Asked, dict[str, str]]:
 def _configured(asked: Asked, options: dict[str, str]) -> Any:
     """The mesh of devices. JAX is configured here, before any of the user's code, which may use it when imported."""
     _join(options)
-    from pegasus_jax.runs.programs import share_processors
+    from pegasus_jax.runs.programs import share_cpus
 
     if not {"mesh", "distributed", "coordinator"} & {*options}:
         search = asked.config.search
         particles = search.particles * search.num_starts if isinstance(search, Search) else None
-        share_processors(len(asked.runs), particles)
+        share_cpus(len(asked.runs), particles)
     return _mesh(options.get("mesh"), len(asked.runs))
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 
-def processors() -> int:
+def cpus() -> int:
     """How many CPUs this process may use."""
     try:
         return len(os.sched_getaffinity(0))
@@ -32,7 +32,7 @@ def about(command: str) -> dict[str, Any]:
         "command": command,
         "python": sys.version.split()[0],
         "platform": platform.platform(),
-        "processor": ", ".join(f"{label}{processor()[name]}" for name, label in NAMED.items() if name in processor()),
+        "processor": ", ".join(f"{label}{cpu()[name]}" for name, label in NAMED.items() if name in cpu()),
         "devices": [str(device) for device in jax.devices()],
         "versions": versions,
     }
@@ -43,7 +43,7 @@ NAMED = {"model name": "", "cpu family": "family ", "model": "model "}
 
 
 @cache
-def processor() -> dict[str, str]:
+def cpu() -> dict[str, str]:
     """What the system says of its first CPU, at least its "model name"; on Linux also what it can execute."""
     known = {"model name": f"{platform.machine()} {platform.processor()}"}
     try:

@@ -19,7 +19,7 @@ from jax.sharding import Mesh, NamedSharding
 from pegasus_jax import interrupt, sharding
 from pegasus_jax.episode import Episode, trimmed
 from pegasus_jax.experiment import Experiment
-from pegasus_jax.runs.machine import processors
+from pegasus_jax.runs.machine import cpus
 from pegasus_jax.types import Params, Trajectory
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
@@ -197,7 +197,7 @@ def begun(function: Callable[..., Any], *arguments: Any) -> Future:
     return coming
 
 
-def share_processors(seeds: int, particles: int | None = None) -> None:
+def share_cpus(seeds: int, particles: int | None = None) -> None:
     """Where a CPU does the work, make a device of as many of its cores as share the seeds evenly, unless JAX was told.
 
     One program for all seeds hardly uses a second core: a seed's matrices are too small to be shared. Where so few
@@ -208,7 +208,7 @@ def share_processors(seeds: int, particles: int | None = None) -> None:
     told = asked > 0 or "xla_force_host_platform" in os.environ.get("XLA_FLAGS", "")
     if told:
         return
-    jax.config.update("jax_num_cpu_devices", max(n for n in range(1, processors() + 1) if seeds % n == 0))
+    jax.config.update("jax_num_cpu_devices", max(n for n in range(1, cpus() + 1) if seeds % n == 0))
     if (
         particles is not None and seeds * particles <= SINGLE_THREAD_BELOW and not entry_points(group="jax_plugins")
     ):  # no accelerator
