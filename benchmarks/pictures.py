@@ -64,7 +64,7 @@ def plants() -> None:
     for name, row in poses().items():
         figure, axes = plt.subplots(1, len(row), figsize=(2.4 * len(row), 2.1), dpi=80)
         for axis, (title, plant, x) in zip(axes, row, strict=True):
-            (picture,) = frames(plant, [plant.place(jnp.asarray(x, jnp.float32))], 280, 220)
+            (picture,) = frames(plant, [plant.state_from_observation(jnp.asarray(x, jnp.float32))], 280, 220)
             axis.imshow(picture)
             axis.set_title(title, fontsize=9)
             axis.axis("off")
@@ -79,7 +79,7 @@ def swing_up(run: Path, path: Path, shown: int = 9) -> None:
     episode = jax.jit(experiment.episode)(jax.random.key(1), state.policy.params, jnp.asarray(False))
     plant = experiment.task.plant
     times = np.linspace(0, experiment.task.horizon, shown).round().astype(int)
-    pictures = frames(plant, [plant.place(episode.x[t]) for t in times], 320, 320)
+    pictures = frames(plant, [plant.state_from_observation(episode.x[t]) for t in times], 320, 320)
     figure, axes = plt.subplots(1, shown, figsize=(1.5 * shown, 1.8))
     for axis, t, picture in zip(axes, times, pictures, strict=True):
         axis.imshow(picture)

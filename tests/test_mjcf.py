@@ -81,7 +81,9 @@ def test_what_is_observed_is_placed(pendulum: mjcf_plant.Mechanism) -> None:
 
 
 def test_is_drawn_without_a_camera_of_its_own(pendulum: mjcf_plant.Mechanism) -> None:
-    one, two = frames(pendulum, [pendulum.place(jnp.array([0.0, a, 0.0, 0.0])) for a in (0.0, 0.5)], 160, 120)
+    one, two = frames(
+        pendulum, [pendulum.state_from_observation(jnp.array([0.0, a, 0.0, 0.0])) for a in (0.0, 0.5)], 160, 120
+    )
     assert np.abs(one.astype(int) - two).max() > 50
 
 

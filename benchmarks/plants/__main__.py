@@ -125,8 +125,11 @@ def energy_drift(plant: Plant) -> float:
     """Largest change over 10 s from a tilt of 1 rad, as a part of what there is above the hanging rest."""
     x = jnp.asarray(plant.start_mean).at[np.array(plant.angles)].add(1.0)
     still = jnp.zeros((round(10.0 / plant.dt), len(plant.control_low)))
-    states = [plant.place(x) for x in jax.jit(lambda x: simulate(plant, plant.place(x), still))(x)]
-    rest = mechanical(plant, plant.place(jnp.asarray(plant.start_mean)))
+    states = [
+        plant.state_from_observation(x)
+        for x in jax.jit(lambda x: simulate(plant, plant.state_from_observation(x), still))(x)
+    ]
+    rest = mechanical(plant, plant.state_from_observation(jnp.asarray(plant.start_mean)))
     energy = np.array([mechanical(plant, state) for state in states]) - rest
     return float(np.abs(energy - energy[0]).max() / energy[0])
 

@@ -8,7 +8,7 @@ from jax import Array
 
 from pegasus_envs import physics
 from pegasus_envs.physics import Motion, Scalar
-from pegasus_envs.plant import FRAME, Plant, draw_start, gliding
+from pegasus_envs.plant import FRAME, Plant, draw_start, substates_of
 
 XML = "cartpole.xml"
 
@@ -36,7 +36,7 @@ def cartpole(
     dt = 0.1
     low, high = system.host.actuator_ctrlrange.T.copy()
 
-    def place(x: Array) -> Motion:
+    def state_from_observation(x: Array) -> Motion:
         return Motion(jnp.stack([x[0], x[3]]), jnp.stack([x[1], x[2]]))
 
     def step(motion: Motion, control: Array, duration: float = dt) -> Motion:
@@ -52,11 +52,11 @@ def cartpole(
 
     start_mean, start_std = np.zeros(4), np.full(4, 0.2)
     return Plant(
-        reset=lambda key: place(draw_start(key, start_mean, start_std)),
+        reset=lambda key: state_from_observation(draw_start(key, start_mean, start_std)),
         step=step,
-        glide=gliding(partial(step, duration=FRAME), dt),
+        substates=substates_of(partial(step, duration=FRAME), dt),
         observe=observe,
-        place=place,
+        state_from_observation=state_from_observation,
         error=error,
         width=0.25,
         control_low=low,

@@ -8,7 +8,7 @@ from jax import Array
 
 from pegasus_envs import physics
 from pegasus_envs.physics import Motion, Scalar
-from pegasus_envs.plant import FRAME, Plant, draw_start, gliding
+from pegasus_envs.plant import FRAME, Plant, draw_start, substates_of
 
 XML = "double_cartpole.xml"
 
@@ -43,7 +43,7 @@ def double_cartpole(
     dt = 0.1
     low, high = system.host.actuator_ctrlrange.T.copy()
 
-    def place(x: Array) -> Motion:
+    def state_from_observation(x: Array) -> Motion:
         position, speed, rate_one, rate_two, one, two = x
         return Motion(jnp.stack([position, one, two - one]), jnp.stack([speed, rate_one, rate_two - rate_one]))
 
@@ -62,11 +62,11 @@ def double_cartpole(
 
     start_mean, start_std = np.array([0.0, 0.0, 0.0, 0.0, np.pi, np.pi]), np.full(6, 0.1)
     return Plant(
-        reset=lambda key: place(draw_start(key, start_mean, start_std)),
+        reset=lambda key: state_from_observation(draw_start(key, start_mean, start_std)),
         step=step,
-        glide=gliding(partial(step, duration=FRAME), dt),
+        substates=substates_of(partial(step, duration=FRAME), dt),
         observe=observe,
-        place=place,
+        state_from_observation=state_from_observation,
         error=error,
         width=0.5,
         control_low=low,

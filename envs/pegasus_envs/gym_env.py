@@ -16,7 +16,7 @@ class _Compiled(NamedTuple):
     """A plant with its functions compiled once for all environments of its kind."""
 
     plant: Plant
-    place: Any
+    state_from_observation: Any
     step: Any
     """(state, control) -> state, x, cost"""
     observe: Any
@@ -62,7 +62,7 @@ class PlantEnv(gymnasium.Env):
         super().reset(seed=seed)
         x = self.np_random.normal(self.plant.start_mean, self.plant.start_std)
         x = np.asarray((options or {}).get("x", x), np.float32)
-        self._state, self._time = self._compiled.place(x), 0
+        self._state, self._time = self._compiled.state_from_observation(x), 0
         x = np.asarray(self._compiled.observe(self._state))
         return self._sensed(x), {"x": x}
 
@@ -108,4 +108,4 @@ def _compile(constructor: str, arguments: tuple[tuple[str, Any], ...]) -> _Compi
         x = observe(following)
         return following, x, cost(x)
 
-    return _Compiled(plant, jax.jit(plant.place), step, observe)
+    return _Compiled(plant, jax.jit(plant.state_from_observation), step, observe)

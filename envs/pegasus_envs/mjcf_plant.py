@@ -45,10 +45,10 @@ class Mechanism(NamedTuple):
 
     reset: Callable[[Array], Moving]
     step: Callable[[Moving, Array], Moving]
-    glide: Callable[[Moving, Array], Moving]
+    substates: Callable[[Moving, Array], Moving]
     """(state, control [U]) -> the states [n, ...] on the way, about one each `FRAME` seconds, for films"""
     observe: Callable[[Moving], Array]
-    place: Callable[[Array], Moving]
+    state_from_observation: Callable[[Array], Moving]
     control_low: np.ndarray
     control_high: np.ndarray
     dt: float
@@ -94,7 +94,7 @@ def mechanism(
     std = filled("start_std", start_std, len(entries), np.zeros(len(entries)))
     device, blank = _on_device(model)
 
-    def place(x: Array) -> Moving:
+    def state_from_observation(x: Array) -> Moving:
         full = jnp.asarray(rest, x.dtype).at[entries].set(x)
         zeros = jnp.zeros(model.nv, x.dtype)
         return Moving(full[: model.nq], full[model.nq :], jnp.zeros(model.na, x.dtype), zeros, jnp.zeros((), x.dtype))
@@ -107,7 +107,7 @@ def mechanism(
 
     between = max(n for n in range(1, count + 1) if count % n == 0 and (n == 1 or n * model.opt.timestep <= FRAME))
 
-    def glide(state: Moving, control: Array) -> Moving:
+    def substates(state: Moving, control: Array) -> Moving:
         def frame(state: Moving, _: None) -> tuple[Moving, Moving]:
             following = advance(between, state, control)
             return following, following
@@ -115,11 +115,11 @@ def mechanism(
         return jax.lax.scan(frame, state, None, length=count // between)[1]
 
     made = Mechanism(
-        reset=lambda key: place(draw_start(key, mean, std)),
+        reset=lambda key: state_from_observation(draw_start(key, mean, std)),
         step=lambda state, control: advance(count, state, control),
-        glide=glide,
+        substates=substates,
         observe=lambda state: jnp.concatenate([state.qpos, state.qvel])[entries],
-        place=place,
+        state_from_observation=state_from_observation,
         control_low=low,
         control_high=high,
         dt=dt,

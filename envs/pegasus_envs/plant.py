@@ -23,11 +23,11 @@ class Plant(NamedTuple):
     """key -> physical state, drawn from N(start_mean, diag(start_std^2))"""
     step: Callable[[State, Array], State]
     """(state, control [U]) -> state one control period later; the control is held, and clipped to its limits"""
-    glide: Callable[[State, Array], State]
+    substates: Callable[[State, Array], State]
     """(state, control [U]) -> the states [n, ...] on the way, one each `FRAME` seconds, for films"""
     observe: Callable[[State], Array]
     """state -> x [D], free of noise"""
-    place: Callable[[Array], State]
+    state_from_observation: Callable[[Array], State]
     """x [D] -> a physical state that observes as x; what x does not tell is at rest"""
     error: Callable[[Array], Array]
     """x [D] -> e [E], zero at the goal; affine in (x without its angles, sin and cos of its angles)"""
@@ -60,17 +60,17 @@ def saturating(plant: Plant, x: Array) -> Array:
     return -jnp.expm1(-0.5 * (error @ error) / plant.width**2)
 
 
-def gliding(move: Callable[[State, Array], State], dt: float) -> Callable[[State, Array], State]:
-    """A plant's `glide`: `move` goes on by `FRAME` seconds, the control period is `dt`."""
+def substates_of(move: Callable[[State, Array], State], dt: float) -> Callable[[State, Array], State]:
+    """A plant's `substates`: `move` goes on by `FRAME` seconds, the control period is `dt`."""
 
-    def glide(state: State, control: Array) -> State:
+    def substates(state: State, control: Array) -> State:
         def advance(state: State, _: None) -> tuple[State, State]:
             following = move(state, control)
             return following, following
 
         return jax.lax.scan(advance, state, None, length=round(dt / FRAME))[1]
 
-    return glide
+    return substates
 
 
 def draw_start(key: Array, mean: np.ndarray, std: np.ndarray) -> Array:

@@ -25,7 +25,10 @@ def system(request):
 
 def errors(system, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Largest error over the state at each time, against the paper's equations and against C MuJoCo, from hanging."""
-    state, controls = system.plant.place(system.plant.start_mean.astype(np.float32)), system.random(seed)
+    state, controls = (
+        system.plant.state_from_observation(system.plant.start_mean.astype(np.float32)),
+        system.random(seed),
+    )
     xs = np.asarray(system.run(state, controls), float)
     exact = references.integrate(RATES[xs.shape[1]], xs[0], controls)
     qpos, qvel, _ = in_c(system.plant, state.qpos, state.qvel, controls)
@@ -60,7 +63,7 @@ def test_errors_of_the_double_cartpole_grow_from_rounding(double):
 def test_keeps_its_energy_without_friction(construct, tilt):
     plant = construct(friction=0.0)
     x = jnp.asarray(plant.start_mean).at[np.array(plant.angles)].add(tilt)
-    xs = np.asarray(jax.jit(lambda x: simulate(plant, plant.place(x), jnp.zeros((100, 1))))(x), float)
+    xs = np.asarray(jax.jit(lambda x: simulate(plant, plant.state_from_observation(x), jnp.zeros((100, 1))))(x), float)
     energy = references.energy(xs)
     # The zero of energy is a matter of taste: compare with what there is above the hanging rest.
     rest = references.energy(np.asarray(plant.start_mean)[None])[0]
@@ -110,7 +113,9 @@ def test_goal_is_where_the_tip_stands_upright(cart, double):
 def test_error_points_at_the_tip_that_mujoco_sees(cart, double):
     for system in (cart, double):
         plant = system.plant
-        states = [plant.place(x) for x in np.random.default_rng(0).normal(size=(5, len(plant.start_mean)))]
+        states = [
+            plant.state_from_observation(x) for x in np.random.default_rng(0).normal(size=(5, len(plant.start_mean)))
+        ]
         for state in states:
             tip = _geom(plant, np.asarray(state.qpos), "tip") - _geom(plant, np.asarray(state.qpos), "goal")
             np.testing.assert_allclose(jnp.abs(plant.error(plant.observe(state))), np.abs(tip[[0, 2]]), atol=1e-5)
@@ -169,14 +174,14 @@ def test_start_has_the_stated_spread(cart):
 
 def test_place_is_the_inverse_of_observe(system):
     x = np.random.default_rng(0).normal(size=len(system.plant.start_mean)).astype(np.float32)
-    np.testing.assert_allclose(system.plant.observe(system.plant.place(x)), x, atol=1e-6)
+    np.testing.assert_allclose(system.plant.observe(system.plant.state_from_observation(x)), x, atol=1e-6)
 
 
 @pytest.mark.parametrize("construct", [cartpole, pytest.param(double_cartpole, marks=pytest.mark.slow)])
 def test_gradient_matches_finite_differences(construct):
     with jax.enable_x64(True):
         plant = construct()
-        state = plant.place(jnp.array([0.1, -0.2, 0.3, 0.4, 1.0, 2.0])[: len(plant.start_mean)])
+        state = plant.state_from_observation(jnp.array([0.1, -0.2, 0.3, 0.4, 1.0, 2.0])[: len(plant.start_mean)])
         controls = jnp.asarray(np.random.default_rng(0).uniform(-8, 8, (5, 1)))
         final = jax.jit(lambda force: simulate(plant, state, controls.at[1, 0].set(force))[-1])
         gradient = jax.jit(jax.jacfwd(final))(2.0)
@@ -202,5 +207,5 @@ def test_double_precision_agrees_with_mjx_step():
 
 def test_module_shares_nothing_between_precisions():
     with jax.enable_x64(True):
-        assert simulated(cartpole()).plant.observe(cartpole().place(jnp.zeros(4))).dtype == jnp.float64
-    assert cartpole().observe(cartpole().place(jnp.zeros(4))).dtype == jnp.float32
+        assert simulated(cartpole()).plant.observe(cartpole().state_from_observation(jnp.zeros(4))).dtype == jnp.float64
+    assert cartpole().observe(cartpole().state_from_observation(jnp.zeros(4))).dtype == jnp.float32

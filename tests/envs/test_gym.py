@@ -69,7 +69,7 @@ def test_environments_of_one_kind_share_one_compilation():
 )
 def test_pictures_show_the_motion(name):
     plant = gymnasium.make(name).unwrapped.plant
-    low, high = (plant.place(jnp.asarray(plant.start_mean + tilt, jnp.float32)) for tilt in (0.0, 0.3))
+    low, high = (plant.state_from_observation(jnp.asarray(plant.start_mean + tilt, jnp.float32)) for tilt in (0.0, 0.3))
     one, two, same = frames(plant, [low, high, low], width=160, height=120)
     assert one.shape == (120, 160, 3)
     assert one.std() > 10
@@ -81,11 +81,11 @@ def test_pictures_show_the_motion(name):
     "name", ["pegasus/CartPoleSwingUp-v0", "pegasus/DoubleCartPole-v0", "pegasus/Swimmer2KnifeEdge-v0"]
 )
 def test_a_film_ends_each_period_where_the_plant_does(name):
-    """`glide` passes through `FRAME`-spaced states, none like the one before it, to the state that `step` gives."""
+    """`substates` passes through `FRAME`-spaced states, none like the one before it, to the state that `step` gives."""
     plant = gymnasium.make(name).unwrapped.plant
-    state = plant.place(jnp.asarray(plant.start_mean + 0.1, jnp.float32))
+    state = plant.state_from_observation(jnp.asarray(plant.start_mean + 0.1, jnp.float32))
     control = jnp.asarray(0.7 * plant.control_high, jnp.float32)
-    on_the_way, after = jax.jit(plant.glide)(state, control), jax.jit(plant.step)(state, control)
+    on_the_way, after = jax.jit(plant.substates)(state, control), jax.jit(plant.step)(state, control)
     positions = np.stack([plant.qpos(entry) for entry in unstack(on_the_way)])
     assert len(positions) * FRAME == pytest.approx(plant.dt)
     np.testing.assert_allclose(positions[-1], plant.qpos(after), atol=1e-4)

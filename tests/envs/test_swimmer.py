@@ -62,7 +62,7 @@ def test_roll_wraps_without_a_jump_in_cost(task):
     x = jnp.asarray(plant.start_mean, jnp.float32)
     before, after = x.at[0].set(np.pi - 1e-4), x.at[0].set(-np.pi + 1e-4)
     np.testing.assert_allclose(plant.error(before), plant.error(after), atol=1e-3)
-    rolled = jax.vmap(lambda roll: saturating(plant, plant.observe(plant.place(x.at[0].set(roll)))))
+    rolled = jax.vmap(lambda roll: saturating(plant, plant.observe(plant.state_from_observation(x.at[0].set(roll)))))
     costs = rolled(jnp.linspace(np.pi - 0.05, np.pi + 0.05, 41))
     assert np.abs(np.diff(costs)).max() < 5e-3
 
@@ -130,7 +130,7 @@ def test_constants_can_be_mapped_over(swim):
 def test_gradient_matches_finite_differences():
     with jax.enable_x64(True):
         plant = swimmer("knife_edge", 6)
-        state = plant.place(jnp.asarray(plant.start_mean + 0.1))
+        state = plant.state_from_observation(jnp.asarray(plant.start_mean + 0.1))
         control = jnp.asarray(0.5 * plant.control_high)
         final = jax.jit(lambda offset: plant.observe(plant.step(state, control.at[7].set(offset))))
         gradient = jax.jit(jax.jacfwd(lambda offset: plant.observe(plant.step(state, control.at[7].set(offset)))))(0.2)

@@ -13,7 +13,7 @@ from jax import Array
 from pegasus_envs import physics
 from pegasus_envs.batching import batch_last
 from pegasus_envs.physics import Motion, Scalar
-from pegasus_envs.plant import FRAME, Plant, draw_start, gliding
+from pegasus_envs.plant import FRAME, Plant, draw_start, substates_of
 from pegasus_envs.swimmer import dynamics
 from pegasus_envs.swimmer.goals import START_DEPTH, Cost, Task, goal
 from pegasus_envs.swimmer.layout import Mechanism, mechanism
@@ -86,11 +86,11 @@ def swimmer(
     start_mean[3] = START_DEPTH
     start_std = np.where(np.arange(dimensions) < 7, 0.1, 0.0)
     return Plant(
-        reset=lambda key: body.place(draw_start(key, start_mean, start_std)),
+        reset=lambda key: body.state_from_observation(draw_start(key, start_mean, start_std)),
         step=body.step,
-        glide=body.glide,
+        substates=body.substates,
         observe=body.observe,
-        place=body.place,
+        state_from_observation=body.state_from_observation,
         error=aim.error,
         width=aim.width,
         control_low=low,
@@ -111,9 +111,9 @@ def swimmer(
 class _Body(NamedTuple):
     """What the maneuvers share."""
 
-    place: Callable[[Array], Swimming]
+    state_from_observation: Callable[[Array], Swimming]
     step: Callable[[Swimming, Array], Swimming]
-    glide: Callable[[Swimming, Array], Swimming]
+    substates: Callable[[Swimming, Array], Swimming]
     observe: Callable[[Swimming], Array]
     model: Any
 
@@ -139,7 +139,7 @@ def _new_body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
     dt, window = _PERIODS[legs], round(1.0 / stroke_rate / tick)
     keep = np.exp(-tick / LAG)
 
-    def place(x: Array) -> Swimming:
+    def state_from_observation(x: Array) -> Swimming:
         hips = x[7:] if legs == 6 else jnp.zeros(6, x.dtype)
         joints = jnp.stack([hips, jnp.zeros_like(hips)], axis=1).reshape(-1)
         position = jnp.zeros(3, x.dtype).at[2].set(-x[3])
@@ -169,7 +169,7 @@ def _new_body(legs: int, stroke_rate: float, *constants: Scalar) -> _Body:
         depth, hips = -state.qpos[2:3], state.qpos[HIPS]
         return jnp.concatenate([angles_of(state.qpos[3:7]), depth, state.rate, hips])[:dimensions]
 
-    return _Body(place, stepping(dt), gliding(stepping(FRAME), dt), observe, system.host)
+    return _Body(state_from_observation, stepping(dt), substates_of(stepping(FRAME), dt), observe, system.host)
 
 
 def hip_angles(command: Array, stroke: Array) -> Array:

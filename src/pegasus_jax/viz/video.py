@@ -70,7 +70,7 @@ def performance(key: Key, params: Params, *, task: Task, policy: Policy) -> tupl
     def act(key: Key, t: Array, x: Array) -> Array:
         return policy.apply(params, policy.sample(key), x)
 
-    return episode.run_with_trace(key, act, task, task.plant.glide)
+    return episode.run_with_trace(key, act, task, task.plant.substates)
 
 
 def strip(trajectory: Trajectory, task: Task, title: str) -> Strip:
