@@ -134,7 +134,7 @@ def _() -> Any:
 def _() -> Any:
     """Every piece of one's own takes the configured one's place."""
     fitted = pg.minibatches(DYNAMICS, optax.sgd(1e-3, momentum=0.9), batch_size=3)
-    still = pg.Searcher(init=lambda params: (), run=lambda key, learner, *_, **__: (learner, "searched"))
+    still = pg.PolicyOptimizer(init=lambda params: (), run=lambda key, learner, *_, **__: (learner, "searched"))
     twice = pg.Cost(lambda x: 2 * jnp.sum(x**2))
     config = dataclasses.replace(CONFIG, search=dataclasses.replace(CONFIG.search, cost_width_start=1.0))
     own: dict[str, Any] = dict(dynamics=DYNAMICS, policy=POLICY, fitter=fitted, searcher=still, cost=twice)
@@ -223,18 +223,18 @@ def _() -> Any:
 @example("fit", "minibatches")
 def _() -> Any:
     optimizer, params = optax.adam(1e-3), DYNAMICS.init(key())
-    learner = pg.Learner(params, optimizer.init(params))
+    learner = pg.TrainState(params, optimizer.init(params))
     how: dict[str, Any] = dict(prepare=DYNAMICS.prepare, loss=DYNAMICS.loss, optimizer=optimizer, batch_size=4)
     by_hand = pg.fit(key(), learner, experience(), steps=3, **how)
     fitter = pg.minibatches(DYNAMICS, optimizer, batch_size=4)
-    return by_hand, fitter.run(key(), pg.Learner(params, fitter.init(params)), experience(), 3)
+    return by_hand, fitter.run(key(), pg.TrainState(params, fitter.init(params)), experience(), 3)
 
 
 @example("gradient_search", "sampler")
 def _() -> Any:
     params, posterior, _ = imagined()
     optimizer, draws = optax.adam(1e-3), pg.sampler(blocks(), pg.Period())
-    learner = pg.Learner(params, optimizer.init(params))
+    learner = pg.TrainState(params, optimizer.init(params))
     how: dict[str, Any] = dict(objective=J, sampler=draws, optimizer=optimizer, steps=2)
     learner, info = pg.gradient_search(key(), learner, posterior, **how)
     assert info.objective.shape == (2,)
@@ -249,7 +249,7 @@ def _() -> Any:
     of_row = lambda params, posterior, scenarios, row: J(params, posterior, scenarios)  # noqa: E731
     problem = pg.Problem(of_row, pg.sampler(blocks(), pg.Period()), optax.adam(1e-3), table)
     found = pg.searcher(problem)
-    learner = pg.Learner(params, found.init(params))
+    learner = pg.TrainState(params, found.init(params))
     assert isinstance(learner.optimizer, pg.SearchState)
     fresh = POLICY.init(jax.random.key(1))
     by_hand = pg.search(key(), learner, posterior, problem=problem, steps=2, fresh=fresh)
@@ -409,6 +409,8 @@ def test_names_are_complete_and_others_are_refused() -> None:
     assert pg.__version__.count(".") == 2
     with pytest.raises(AttributeError, match="no attribute rolout"):
         pg.rolout  # noqa: B018
+    with pytest.raises(AttributeError, match=r"pegasus_jax\.Searcher is now called PolicyOptimizer"):
+        pg.Searcher  # noqa: B018
 
 
 def test_the_page_of_public_names_is_complete() -> None:
@@ -461,8 +463,8 @@ def test_a_piece_of_your_own_that_answers_wrongly_is_named(piece: str, wrong: An
 
 def test_a_learner_is_no_parameters() -> None:
     params, *rest = imagined()
-    with pytest.raises(ValueError, match=r"policy_params is a Learner; .*policy_params=learner\.params"):
-        jax.eval_shape(partial(pg.rollout, **PIECES), pg.Learner(params, ()), *rest)
+    with pytest.raises(ValueError, match=r"policy_params is a TrainState; .*policy_params=learner\.params"):
+        jax.eval_shape(partial(pg.rollout, **PIECES), pg.TrainState(params, ()), *rest)
 
 
 def test_an_episode_names_what_is_wrong_with_it() -> None:

@@ -13,7 +13,7 @@ from pegasus_jax.learn.fit import fit
 from pegasus_jax.models import dropout
 from pegasus_jax.models.bnn import bnn
 from pegasus_jax.models.networks import HEADS
-from pegasus_jax.types import Batch, Dataset, Learner
+from pegasus_jax.types import Batch, Dataset, TrainState
 from probes import experience, network
 
 BATCH = Batch(*(rows[:6] for rows in experience()[:3]))
@@ -165,7 +165,7 @@ def learned(std, *, kind="none", head="softplus", heteroscedastic=True, steps=15
     def run(key, data):
         init_key, fit_key, draw_key = jax.random.split(key, 3)
         params = model.init(init_key)
-        learner, info = fitted(fit_key, Learner(params, optimizer.init(params)), data)
+        learner, info = fitted(fit_key, TrainState(params, optimizer.init(params)), data)
         posterior = model.posterior(learner.params, data)
         return posterior, jax.vmap(model.sample, (0, None))(jax.random.split(draw_key, 100), posterior), info
 

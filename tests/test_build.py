@@ -23,7 +23,7 @@ from pegasus_jax.pilco.ssgp import ssgp
 from pegasus_jax.policies.squash import SQUASHES
 from pegasus_jax.presets import ALGORITHMS, MODELS, POLICIES
 from pegasus_jax.runs import config_io
-from pegasus_jax.types import Cost, Learner
+from pegasus_jax.types import Cost, TrainState
 from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, same, tiny
 
 
@@ -265,7 +265,7 @@ def test_the_settings_of_pilcos_search_reach_its_objective():
         searcher, _ = search_of(chosen, task, dynamics, policy)
         params = jnp.full((1, 2), -0.5)
         run = jax.jit(partial(searcher.run, first=0, steps=1, fresh=params))
-        return float(run(jax.random.key(0), Learner(params, searcher.init(params)), None)[1].objective[0])
+        return float(run(jax.random.key(0), TrainState(params, searcher.init(params)), None)[1].objective[0])
 
     of_cart = partial(value, cart(horizon=3))
     plain = of_cart()

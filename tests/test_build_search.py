@@ -21,7 +21,7 @@ from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching, scenarios
 from pegasus_jax.imagine.objective import objective
 from pegasus_jax.learn.fit import falling
-from pegasus_jax.types import Cost, Dataset, Learner
+from pegasus_jax.types import Cost, Dataset, TrainState
 from probes import PENDULUM, cart, known, linear_policy, tiny
 
 
@@ -107,7 +107,7 @@ def test_after_a_stale_search_the_next_begins_from_a_fresh_policy_and_keeps_the_
     still = dict(gain=0.3, refine_fraction=0.5, learning_rate=1e-30, cost_estimator="gaussian", **HELD)
     (_, fresh, run), (_, _, obstinate) = searcher(init="better", **still), searcher(**still)
     good = -0.5 * jnp.array([[1.0, 1.6]])
-    stale, info = run(fresh._replace(policy=Learner(good, fresh.policy.optimizer)))
+    stale, info = run(fresh._replace(policy=TrainState(good, fresh.policy.optimizer)))
     again, known = run(stale)
     assert np.array_equal(stale.policy.params, good)
     assert np.array_equal(again.policy.params, good)
@@ -120,7 +120,7 @@ def test_a_search_that_always_begins_anew_keeps_a_policy_that_is_better():
     still = dict(gain=0.3, refine_fraction=0.5, learning_rate=1e-30, cost_estimator="gaussian", **HELD)
     (_, fresh, run), (_, _, usual) = (searcher(init=init, **still) for init in ("fresh", "better"))
     good = -0.5 * jnp.array([[1.0, 1.6]])
-    state = fresh._replace(policy=Learner(good, fresh.policy.optimizer))
+    state = fresh._replace(policy=TrainState(good, fresh.policy.optimizer))
     after, info = run(state)
     assert info.objective[0] == usual(fresh)[1].objective[0] > usual(state)[1].objective[0]
     assert np.array_equal(after.policy.params, good)
@@ -309,7 +309,7 @@ def test_a_falling_step_size_reaches_the_fit():
     for decay in (1.0, 0.0):
         fit = fit_of(config.Fit(steps=2, batch_size=1, decay=decay, learning_rate=1e-5), dynamics)
         params = dynamics.init(jax.random.key(0))
-        learner, _ = fit.run(jax.random.key(1), Learner(params, fit.init(params)), Dataset(*row, jnp.int32(1)), 2)
+        learner, _ = fit.run(jax.random.key(1), TrainState(params, fit.init(params)), Dataset(*row, jnp.int32(1)), 2)
         moved[decay] = np.abs(ravel_pytree(learner.params)[0] - ravel_pytree(params)[0]).max()
     np.testing.assert_allclose(moved[0.0], moved[1.0] * 3 / 4, rtol=0.05)
 

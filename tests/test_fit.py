@@ -10,7 +10,7 @@ import pytest
 
 from pegasus_jax.learn.data import minibatch
 from pegasus_jax.learn.fit import fit
-from pegasus_jax.types import Dataset, Learner
+from pegasus_jax.types import Dataset, TrainState
 from probes import same
 
 N, SIZE = 30, 12
@@ -34,7 +34,7 @@ def squares(params, key, batch, context):
 def make(loss=squares, optimizer=None, steps=50, batch_size=8, prepare=lambda data: None):
     optimizer = optimizer or optax.adam(optax.cosine_decay_schedule(0.1, steps))
     fitted = jax.jit(partial(fit, prepare=prepare, loss=loss, optimizer=optimizer, steps=steps, batch_size=batch_size))
-    return fitted, Learner(jnp.zeros((2, 2)), optimizer.init(jnp.zeros((2, 2))))
+    return fitted, TrainState(jnp.zeros((2, 2)), optimizer.init(jnp.zeros((2, 2))))
 
 
 @pytest.mark.parametrize("junk", [0.0, np.nan])

@@ -13,7 +13,7 @@ from pegasus_jax.pilco import kernels
 from pegasus_jax.pilco.gp import gp, log_evidence
 from pegasus_jax.pilco.lbfgs import full_data
 from pegasus_jax.pilco.ssgp import ssgp
-from pegasus_jax.types import Dataset, Learner
+from pegasus_jax.types import Dataset, TrainState
 from probes import experience, same
 
 SHAPES = dict(states=3, controls=2, angles=(2,))
@@ -212,7 +212,7 @@ def fitted(model, starts=5, steps=100):
     @jax.jit
     def run(key, data):
         first, second = jax.random.split(key)
-        learner = Learner(model.init(first), fitter.init(None))
+        learner = TrainState(model.init(first), fitter.init(None))
         return fitter.run(second, learner, data, steps)
 
     return run
@@ -261,7 +261,7 @@ def test_no_data_make_nan(kind):
     def everything(data):
         nonlocal traces
         traces += 1
-        learner = Learner(model.init(jax.random.key(0)), fitter.init(None))
+        learner = TrainState(model.init(jax.random.key(0)), fitter.init(None))
         learner, info = fitter.run(jax.random.key(1), learner, data, 30)
         posterior = model.posterior(learner.params, data)
         draw = model.sample(jax.random.key(2), posterior)

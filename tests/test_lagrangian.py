@@ -13,7 +13,7 @@ from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import fit
 from pegasus_jax.models import dropout
 from pegasus_jax.models.lagrangian import LEAST_MASS, Posterior, Units, lagrangian, solve
-from pegasus_jax.types import Learner, Trajectory
+from pegasus_jax.types import TrainState, Trajectory
 
 SPEEDS = (2, 1)  # x is (cart, pole's speed, cart's speed, pole)
 
@@ -81,7 +81,7 @@ def fitted(data):
     optimizer = optax.adam(1e-2)
     params = model.init(jax.random.key(1))
     learn = partial(fit, prepare=model.prepare, loss=model.loss, optimizer=optimizer, steps=1500, batch_size=50)
-    learner, info = jax.jit(learn)(jax.random.key(2), Learner(params, optimizer.init(params)), known)
+    learner, info = jax.jit(learn)(jax.random.key(2), TrainState(params, optimizer.init(params)), known)
     assert int(info.skipped) == 0
     return model, model.posterior(learner.params, known)
 

@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize
 
 from pegasus_jax.pilco.lbfgs import full_data, minimize
-from pegasus_jax.types import Dataset, Learner
+from pegasus_jax.types import Dataset, TrainState
 from probes import regression, same
 
 
@@ -80,7 +80,7 @@ def linear(spread=1.0):
 def test_it_finds_the_least_squares():
     fitter = full_data(linear(), num_starts=3)
     run = jax.jit(fitter.run, static_argnums=3)
-    learner, info = run(jax.random.key(0), Learner(jnp.zeros((3, 2)), fitter.init(None)), data(), 50)
+    learner, info = run(jax.random.key(0), TrainState(jnp.zeros((3, 2)), fitter.init(None)), data(), 50)
     np.testing.assert_allclose(learner.params, SLOPE, atol=1e-3)
     assert info.loss < 1e-5 < info.first
 
@@ -89,19 +89,19 @@ def test_it_starts_from_the_best_of_its_starts_and_the_current_parameters():
     model = linear(spread=2.0)
     fitter = full_data(model, num_starts=20)
     run = jax.jit(fitter.run, static_argnums=3)
-    poor = Learner(jnp.full((3, 2), 50.0), fitter.init(None))
+    poor = TrainState(jnp.full((3, 2), 50.0), fitter.init(None))
     started = run(jax.random.key(0), poor, data(), 0)
     value = model.loss(started[0].params, None, None, data())
     np.testing.assert_allclose(started[1].first, value, rtol=1e-6)
     drawn = [model.loss(model.init(key), None, None, data()) for key in jax.random.split(jax.random.key(1), 200)]
     assert value < np.quantile(drawn, 0.2)  # one among 20 is, but for one chance in 100
-    good = Learner(jnp.asarray(SLOPE + 0.01), fitter.init(None))
+    good = TrainState(jnp.asarray(SLOPE + 0.01), fitter.init(None))
     assert same(run(jax.random.key(0), good, data(), 0)[0].params, good.params)
 
 
 def test_a_start_that_is_not_finite_is_not_chosen():
     fitter = full_data(linear(), num_starts=2)
     run = jax.jit(fitter.run, static_argnums=3)
-    learner, info = run(jax.random.key(0), Learner(jnp.full((3, 2), jnp.nan), fitter.init(None)), data(), 50)
+    learner, info = run(jax.random.key(0), TrainState(jnp.full((3, 2), jnp.nan), fitter.init(None)), data(), 50)
     np.testing.assert_allclose(learner.params, SLOPE, atol=1e-3)
     assert info.skipped == 0

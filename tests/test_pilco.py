@@ -15,7 +15,7 @@ from pegasus_jax.math import angles, gaussian
 from pegasus_jax.pilco import search
 from pegasus_jax.pilco.rbf import NOISE, rbf
 from pegasus_jax.policies.squash import SQUASHES, to_limits
-from pegasus_jax.types import Cost, Learner, Policy
+from pegasus_jax.types import Cost, Policy, TrainState
 from probes import PENDULUM, SCALAR, known, linear_policy, same
 
 D, F, POINTS, UNITS = 3, 4, 12, 6  # the last state is an angle; one control
@@ -351,7 +351,7 @@ def test_the_search_finds_the_best_gain(plant):
     best = minimize(value, np.full(shape, -1.0).ravel(), tol=1e-12)
     searcher, run = linear_search(plant)
     gain = jnp.zeros(shape)
-    learner, info = run(jax.random.key(0), Learner(gain, searcher.init(gain)), 1.0, first=0, steps=30)
+    learner, info = run(jax.random.key(0), TrainState(gain, searcher.init(gain)), 1.0, first=0, steps=30)
     np.testing.assert_allclose(learner.params.ravel(), best.x, atol=1e-5)
     np.testing.assert_allclose(info.objective[0], value(np.zeros(shape)), rtol=1e-9)
     np.testing.assert_allclose(info.objective[-1], best.fun, rtol=1e-9, atol=1e-12)
@@ -364,8 +364,8 @@ def test_the_search_finds_the_best_gain(plant):
 def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     searcher, run = linear_search(PENDULUM)
     gain = jnp.zeros((1, 2))
-    whole, info = run(jax.random.key(0), Learner(gain, searcher.init(gain)), 1.0, first=0, steps=6)
-    learner, values = Learner(gain, searcher.init(gain)), []
+    whole, info = run(jax.random.key(0), TrainState(gain, searcher.init(gain)), 1.0, first=0, steps=6)
+    learner, values = TrainState(gain, searcher.init(gain)), []
     for first in (0, 2, 4):
         learner, part = run(jax.random.key(0), learner, 1.0, first=first, steps=2)
         values.append(part.objective)
@@ -376,10 +376,10 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
 def test_a_new_search_remembers_nothing_but_the_parameters():
     searcher, run = linear_search(PENDULUM)
     gain = jnp.full((1, 2), 0.1)
-    used, _ = run(jax.random.key(0), Learner(gain, searcher.init(gain)), 1.0, first=0, steps=6)
+    used, _ = run(jax.random.key(0), TrainState(gain, searcher.init(gain)), 1.0, first=0, steps=6)
     key = jax.random.key(1)
-    again, info = run(key, Learner(gain, used.optimizer), 2.0, first=0, steps=6)
-    fresh, expected = run(jax.random.clone(key), Learner(gain, searcher.init(gain)), 2.0, first=0, steps=6)
+    again, info = run(key, TrainState(gain, used.optimizer), 2.0, first=0, steps=6)
+    fresh, expected = run(jax.random.clone(key), TrainState(gain, searcher.init(gain)), 2.0, first=0, steps=6)
     assert same(again, fresh)
     assert same(info, expected)
 
@@ -393,7 +393,7 @@ def test_the_search_stays_where_the_objective_is_finite():
     searcher = search.analytic(value, lambda key, posterior: jnp.zeros(1))
     start = jnp.zeros(())
     learner, info = jax.jit(partial(searcher.run, steps=20))(
-        jax.random.key(0), Learner(start, searcher.init(start)), None, first=0
+        jax.random.key(0), TrainState(start, searcher.init(start)), None, first=0
     )
     assert 0.4 < float(learner.params) <= 0.5
     assert np.all(np.isfinite(info.objective))

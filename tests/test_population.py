@@ -14,7 +14,7 @@ from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.learn.multistart import best_of
-from pegasus_jax.types import Learner, Searcher
+from pegasus_jax.types import PolicyOptimizer, TrainState
 from probes import cart, noisy_linear_policy, regression, same, tiny, unchecked
 
 STARTS, STEPS, DEEPER = 4, 60, 0.1
@@ -33,19 +33,19 @@ def descent():
         def step(learner, _):
             value, gradient = jax.value_and_grad(wells)(learner.params, posterior)
             updates, state = optimizer.update(gradient, learner.optimizer)
-            return Learner(learner.params + updates, state), (value, jnp.abs(gradient))
+            return TrainState(learner.params + updates, state), (value, jnp.abs(gradient))
 
         learner, (values, norms) = jax.lax.scan(step, learner, None, steps)
         return learner, SearchInfo(values, norms, jnp.int32(0))
 
-    return Searcher(optimizer.init, run)
+    return PolicyOptimizer(optimizer.init, run)
 
 
 def found(own, others, key=0, calls=1):
     """(learner, info) of a search of 60 iterations in so many calls."""
     fresh = lambda key, given: jax.random.choice(key, jnp.asarray(others))  # noqa: E731
     searcher = best_of(descent(), fresh, num_starts=STARTS, window=STEPS // 20)
-    learner = Learner(jnp.float32(own), searcher.init(jnp.float32(own)))
+    learner = TrainState(jnp.float32(own), searcher.init(jnp.float32(own)))
     run, info = jax.jit(partial(searcher.run, steps=STEPS // calls)), None
     for call in range(calls):
         learner, info = run(jax.random.key(key), learner, DEEPER, first=call * (STEPS // calls))
@@ -62,7 +62,7 @@ def test_a_policy_in_the_wrong_valley_gives_way_to_a_fresh_one():
 def test_a_policy_in_the_right_valley_stays_itself():
     learner, _ = found(1.2, [-0.8])
     alone, _ = descent().run(
-        None, Learner(jnp.float32(1.2), optax.sgd(0.02, momentum=0.5).init(0.0)), DEEPER, first=0, steps=STEPS
+        None, TrainState(jnp.float32(1.2), optax.sgd(0.02, momentum=0.5).init(0.0)), DEEPER, first=0, steps=STEPS
     )
     np.testing.assert_allclose(learner.params, alone.params, rtol=1e-6)
 
@@ -93,12 +93,12 @@ def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_
     def members(lasting):
         """After a search of 3 iterations, and after one more, with another key."""
         searcher = best_of(descent(), fresh, num_starts=STARTS, window=1, lasting=lasting)
-        learner = Learner(jnp.float32(0.3), searcher.init(jnp.float32(0.3)))
+        learner = TrainState(jnp.float32(0.3), searcher.init(jnp.float32(0.3)))
         first, _ = searcher.run(jax.random.key(0), learner, DEEPER, first=0, earlier=0, steps=3)
         second, _ = searcher.run(jax.random.key(1), first, DEEPER, first=0, earlier=1, steps=3)
         return first, second
 
-    begun = jax.vmap(lambda own: descent().run(None, Learner(own, descent().init(own)), DEEPER, first=0, steps=3)[0])
+    begun = jax.vmap(lambda own: descent().run(None, TrainState(own, descent().init(own)), DEEPER, first=0, steps=3)[0])
     first, second = members(lasting=True)
     assert len(set(first.optimizer.params.tolist())) == STARTS
     np.testing.assert_allclose(second.optimizer.params, begun(first.optimizer.params).params, rtol=1e-6)

@@ -18,7 +18,7 @@ from pegasus_jax.imagine.scenarios import Sampler, sampler
 from pegasus_jax.learn.gradient import gradient_search
 from pegasus_jax.learn.schedule import search_table
 from pegasus_jax.learn.search import Problem, searcher
-from pegasus_jax.types import Cost, Learner, Period, Scenarios
+from pegasus_jax.types import Cost, Period, Scenarios, TrainState
 from probes import (
     EMITTERS,
     PENDULUM,
@@ -151,7 +151,7 @@ def test_the_search_finds_the_best_gain(plant):
             steps=800,
         )
     )
-    learner, info = search(jax.random.key(0), Learner(gain, optimizer.init(gain)), None)
+    learner, info = search(jax.random.key(0), TrainState(gain, optimizer.init(gain)), None)
     best = best_gain(plant, particles)
     if plant is SCALAR:
         np.testing.assert_allclose(best, [[-2.4]], atol=1e-4)  # -a / b brings any state to 0 in one step
@@ -171,7 +171,7 @@ def test_a_known_control_is_found_through_limits_and_costs():
     optimizer = optax.adam(0.05)
     learner, _ = gradient_search(
         jax.random.key(0),
-        Learner(jnp.zeros(1), optimizer.init(jnp.zeros(1))),
+        TrainState(jnp.zeros(1), optimizer.init(jnp.zeros(1))),
         None,
         sampler=Sampler(lambda *_: jnp.zeros(()), lambda key, step, held, posterior: held),
         objective=lambda params, posterior, given: cost_of(2 * jnp.tanh(params)),
@@ -212,7 +212,7 @@ def pursue(optimizer, steps, *, bad=(), value=jnp.nan, scale=1.0):
 
 
 def begin(optimizer):
-    return Learner(jnp.ones(3), optimizer.init(jnp.ones(3)))
+    return TrainState(jnp.ones(3), optimizer.init(jnp.ones(3)))
 
 
 def loop(optimizer, iterations):
@@ -221,7 +221,7 @@ def loop(optimizer, iterations):
     for i in iterations:
         gradient = jax.grad(distance)(learner.params, 1.0, follow(jax.random.clone(key), i, None))
         updates, state = optimizer.update(gradient, learner.optimizer, learner.params)
-        learner = Learner(optax.apply_updates(learner.params, updates), state)
+        learner = TrainState(optax.apply_updates(learner.params, updates), state)
     return learner
 
 
@@ -240,7 +240,7 @@ def on_table(table, optimizer, draw=follow, value=distance, **more):
     """(searcher of a table, its learner at ones); the objective ignores the row unless `value` takes it."""
     drawing = Sampler(draw, lambda key, step, held, posterior: draw(key, step, posterior))
     found = searcher(Problem(value, drawing, optimizer, table, **more))
-    return found, Learner(jnp.ones(3), found.init(jnp.ones(3)))
+    return found, TrainState(jnp.ones(3), found.init(jnp.ones(3)))
 
 
 def rowless(params, posterior, target, row):
@@ -275,7 +275,7 @@ def test_a_fresh_policy_is_taken_where_it_costs_no_more_or_the_last_search_found
     """Of two equal ones the fresh one, because a flat cost leads nowhere; what is not a number never."""
     found, learner = on_table(search_table(1, init="better"), optax.sgd(0.0), STILL, rowless)
     state = learner.optimizer._replace(no_improvement=jnp.asarray(stuck))
-    learner = Learner(jnp.full(3, float(own)), state)
+    learner = TrainState(jnp.full(3, float(own)), state)
     after, info = found.run(jax.random.key(0), learner, 1.0, steps=1, fresh=jnp.full(3, float(other)))
     assert np.array_equal(after.params, np.full(3, other if taken else own))
     np.testing.assert_allclose(info.objective, 3 * float(other if taken else own) ** 2)
@@ -392,7 +392,7 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     compiled = partial(jax.jit, compiler_options=EMITTERS)
     key, posterior = jax.random.key(3), jnp.full((3, 2), 0.2)
     params = jnp.full((1, 2), 0.3)
-    begins = learner = Learner(params, found.init(params))
+    begins = learner = TrainState(params, found.init(params))
     whole, info = compiled(partial(found.run, steps=6))(key, learner, posterior)
     part, values = compiled(partial(found.run, steps=2)), []
     for first in (0, 2, 4):
@@ -403,5 +403,5 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     assert len(np.unique(info.objective)) == 6
     # Alg. 3 as printed is the table of nothing but steps.
     printed = partial(gradient_search, objective=value, sampler=draws, optimizer=optimizer, steps=6)
-    plain, expected = compiled(printed)(key, Learner(params, begins.optimizer.optimizer), posterior)
+    plain, expected = compiled(printed)(key, TrainState(params, begins.optimizer.optimizer), posterior)
     assert same((plain.params, plain.optimizer, expected), (whole.params, whole.optimizer.optimizer, info))

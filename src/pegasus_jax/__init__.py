@@ -44,16 +44,16 @@ if TYPE_CHECKING:
         Dataset,
         Dropout,
         Dynamics,
-        Fitter,
-        Learner,
+        ModelLearner,
         Period,
         Policy,
+        PolicyOptimizer,
         Prediction,
         Rollout,
         RunState,
         Scenarios,
-        Searcher,
         Task,
+        TrainState,
         Trajectory,
     )
     from pegasus_jax.vectorized import Vectorized
@@ -90,7 +90,7 @@ _NAMES = {
     "pilco.rbf": "rbf",
     # the values that pass between them
     "types": "Task Cost Trajectory Dataset Batch Dynamics Prediction Dropout Policy Scenarios Period Rollout"
-    " Learner Fitter Searcher RunState",
+    " TrainState ModelLearner PolicyOptimizer RunState",
     "vectorized": "Vectorized",
 }
 # Families of functions, each a module under a name of its own: `pegasus_jax.costs.mean`.
@@ -104,6 +104,7 @@ _FAMILIES = {
     "matching": "imagine.matching",
     "tasks": "tasks",
 }
+_RENAMED = {"Learner": "TrainState", "Fitter": "ModelLearner", "Searcher": "PolicyOptimizer"}
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
 __all__ = [
@@ -119,11 +120,11 @@ __all__ = [
     "Episode",
     "Experiment",
     "FitInfo",
-    "Fitter",
-    "Learner",
+    "ModelLearner",
     "NoiseUse",
     "Period",
     "Policy",
+    "PolicyOptimizer",
     "Prediction",
     "Problem",
     "Rollout",
@@ -134,9 +135,9 @@ __all__ = [
     "SearchInfo",
     "SearchState",
     "SearchTable",
-    "Searcher",
     "Successor",
     "Task",
+    "TrainState",
     "Trajectory",
     "TrialInfo",
     "Vectorized",
@@ -189,6 +190,8 @@ def __getattr__(name: str) -> Any:
         return version("pegasus-jax")
     if name in _FAMILIES:
         return import_module(f"{__name__}.{_FAMILIES[name]}")
+    if name in _RENAMED:
+        raise AttributeError(f"{__name__}.{name} is now called {_RENAMED[name]}")
     if name not in _MODULES:
         raise AttributeError(f"module {__name__} has no attribute {name}")
     return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -6,7 +6,7 @@ import chex
 import jax
 import jax.numpy as jnp
 
-from pegasus_jax.types import Dataset, Learner, Params, Scenarios
+from pegasus_jax.types import Dataset, Params, Scenarios, TrainState
 
 Shape = tuple[int | None, ...]  # None: any size
 
@@ -36,9 +36,9 @@ def check_particles(name: str, tree: Params, particles: int) -> None:
 
 
 def check_params(name: str, params: Params) -> None:
-    """Raises ValueError for a `Learner` in place of its parameters."""
-    if isinstance(params, Learner):
-        raise ValueError(f"{name} is a Learner; expected its parameters, {name}=learner.params")
+    """Raises ValueError for a `TrainState` in place of its parameters."""
+    if isinstance(params, TrainState):
+        raise ValueError(f"{name} is a TrainState; expected its parameters, {name}=learner.params")
 
 
 def check_scenarios(scenarios: Scenarios) -> None:

@@ -165,27 +165,27 @@ class Task(NamedTuple):
         return self.environment is not None or self.stop is not None
 
 
-class Learner(NamedTuple):
+class TrainState(NamedTuple):
     """Parameters with the state of their optimizer."""
 
     params: Params
     optimizer: Any
 
 
-class Fitter(NamedTuple):
+class ModelLearner(NamedTuple):
     """How a model learns from the data (Alg. 1 line 5)."""
 
     init: Callable[[Params], Any]  # parameters -> the optimizer's state
-    run: Callable[..., tuple[Learner, Any]]  # (key, learner, data, steps) -> (learner, FitInfo)
+    run: Callable[..., tuple[TrainState, Any]]  # (key, learner, data, steps) -> (learner, FitInfo)
 
 
-class Searcher(NamedTuple):
+class PolicyOptimizer(NamedTuple):
     """How a policy improves in imagination (Alg. 1 line 6)."""
 
     init: Callable[[Params], Any]  # parameters -> the optimizer's state
     # (key, learner, posterior, steps=, first=, earlier=, fresh=) -> (learner, SearchInfo): iterations first .. first +
     # steps - 1 of the search after `earlier` others; `fresh` are parameters of a policy that knows nothing
-    run: Callable[..., tuple[Learner, Any]]
+    run: Callable[..., tuple[TrainState, Any]]
 
 
 class RunState(NamedTuple):
@@ -193,7 +193,7 @@ class RunState(NamedTuple):
 
     key: Key
     data: Dataset
-    model: Learner
-    policy: Learner
+    model: TrainState
+    policy: TrainState
     trial: Array  # [] int32, episodes added so far
     policy_trial: Array  # [] int32, the trial after which this policy was learned; 0: it has learned nothing yet

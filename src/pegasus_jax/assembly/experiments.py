@@ -14,7 +14,7 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.imagine.visited import remembering
 from pegasus_jax.sharding import over_particles
-from pegasus_jax.types import Array, Cost, Dynamics, Fitter, Policy, Searcher, Task
+from pegasus_jax.types import Array, Cost, Dynamics, ModelLearner, Policy, PolicyOptimizer, Task
 
 EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 
@@ -31,8 +31,8 @@ def compose(
     *,
     dynamics: Dynamics | None = None,
     policy: Policy | None = None,
-    fitter: Fitter | None = None,
-    searcher: Searcher | None = None,
+    fitter: ModelLearner | None = None,
+    searcher: PolicyOptimizer | None = None,
     cost: Cost | Callable[[Array], Array] | None = None,
     mesh: Mesh | None = None,
 ) -> Experiment:

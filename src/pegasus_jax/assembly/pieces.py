@@ -23,7 +23,7 @@ from pegasus_jax.pilco.ssgp import ssgp
 from pegasus_jax.policies.linear import linear
 from pegasus_jax.policies.mlp import mlp
 from pegasus_jax.policies.squash import SQUASHES, to_limits
-from pegasus_jax.types import Dropout, Dynamics, Fitter, Policy, Task
+from pegasus_jax.types import Dropout, Dynamics, ModelLearner, Policy, Task
 
 NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
     "log_normal": lambda config: dropout.log_normal(config.log_z_min),
@@ -35,7 +35,7 @@ NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
 }
 
 
-def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> Fitter:
+def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> ModelLearner:
     """The configured way of fitting a model."""
     if isinstance(config, settings.LBFGS):
         return full_data(dynamics, num_starts=config.num_starts)

@@ -22,7 +22,7 @@ from pegasus_jax.learn.search import Problem, searcher
 from pegasus_jax.pilco import search as pilco
 from pegasus_jax.policies.scaled import inherited
 from pegasus_jax.sharding import Spread, together
-from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, Rollout, Scenarios, Searcher, Task
+from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, PolicyOptimizer, Rollout, Scenarios, Task
 
 # What search.matching names, for a task's angles.
 MATCHES: dict[str, Callable[[tuple[int, ...]], matching.Match]] = {
@@ -41,7 +41,7 @@ def search_of(
     dynamics: Dynamics,
     policy: Policy,
     spread: Spread = together,
-) -> tuple[Searcher, Imagine]:
+) -> tuple[PolicyOptimizer, Imagine]:
     """The configured way of improving a policy, and fresh imagined rollouts of the same kind, from the task's starts.
 
     With `search.visited_starts` the posterior of `dynamics` is a `Visited`.
@@ -119,7 +119,7 @@ def analytic_search_of(
     dynamics: Dynamics,
     policy: Policy,
     noise: NoiseUse,
-) -> tuple[Searcher, Imagine]:
+) -> tuple[PolicyOptimizer, Imagine]:
     """PILCO's search. Raises ConfigError where a piece has no moments."""
     if task.stop is not None:
         raise ConfigError("algorithm=pilco propagates a Gaussian, which cannot stop; leave out stop=")

@@ -10,7 +10,7 @@ import optax
 from pegasus_jax.learn.data import minibatch
 from pegasus_jax.learn.updates import is_finite, update_if
 from pegasus_jax.shapes import check_data
-from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Fitter, Key, Learner, Params
+from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, ModelLearner, Params, TrainState
 
 
 class FitInfo(NamedTuple):
@@ -23,7 +23,7 @@ class FitInfo(NamedTuple):
 
 def fit(
     key: Key,
-    learner: Learner,
+    learner: TrainState,
     data: Dataset,
     *,
     prepare: Callable[[Dataset], Params],
@@ -31,7 +31,7 @@ def fit(
     optimizer: optax.GradientTransformation,
     steps: int,
     batch_size: int,
-) -> tuple[Learner, FitInfo]:
+) -> tuple[TrainState, FitInfo]:
     """`steps` updates of the model's parameters, each on `batch_size` rows and fresh noise (Alg. 1 line 5).
 
     `optimizer` is any of optax, and `learner.optimizer` its state, `optimizer.init(params)`. A gradient with a
@@ -41,7 +41,7 @@ def fit(
     check_data(data)
     context = prepare(data)
 
-    def step(learner: Learner, key: Key) -> tuple[Learner, tuple[Array, Array]]:
+    def step(learner: TrainState, key: Key) -> tuple[TrainState, tuple[Array, Array]]:
         row_key, noise_key = jax.random.split(key)
         rows = minibatch(row_key, data, batch_size)
 
@@ -52,7 +52,7 @@ def fit(
         finite = is_finite(gradient)
         more = dict(value=value, grad=gradient, value_fn=of_rows)
         updates, state = update_if(finite, optimizer, gradient, learner, **more)
-        return Learner(optax.apply_updates(learner.params, updates), state), (value, finite)
+        return TrainState(optax.apply_updates(learner.params, updates), state), (value, finite)
 
     learner, (losses, finite) = jax.lax.scan(step, learner, jax.random.split(key, steps))
     tenth = max(steps // 10, 1)
@@ -67,10 +67,10 @@ def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
     return lambda count: fall(jnp.asarray(count) % steps)
 
 
-def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch_size: int) -> Fitter:
+def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch_size: int) -> ModelLearner:
     """The fitter that takes `optimizer`'s steps on minibatches; each fit goes on with the moments of the one before."""
 
-    def run(key: Key, learner: Learner, data: Dataset, steps: int) -> tuple[Learner, FitInfo]:
+    def run(key: Key, learner: TrainState, data: Dataset, steps: int) -> tuple[TrainState, FitInfo]:
         return fit(
             key,
             learner,
@@ -82,4 +82,4 @@ def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, 
             batch_size=batch_size,
         )
 
-    return Fitter(optimizer.init, run)
+    return ModelLearner(optimizer.init, run)

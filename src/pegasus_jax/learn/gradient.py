@@ -9,7 +9,7 @@ import optax
 
 from pegasus_jax.imagine.scenarios import Sampler
 from pegasus_jax.learn.updates import is_finite, update_if
-from pegasus_jax.types import Array, Key, Learner, Params, Scenarios
+from pegasus_jax.types import Array, Key, Params, Scenarios, TrainState
 
 
 class SearchInfo(NamedTuple):
@@ -22,25 +22,25 @@ class SearchInfo(NamedTuple):
 
 def gradient_search(
     key: Key,
-    learner: Learner,
+    learner: TrainState,
     posterior: Params,
     *,
     objective: Callable[[Params, Params, Scenarios], Array],
     sampler: Sampler,
     optimizer: optax.GradientTransformation,
     steps: int,
-) -> tuple[Learner, SearchInfo]:
+) -> tuple[TrainState, SearchInfo]:
     """Alg. 3 as printed: `steps` updates along the gradient of `objective` under the scenarios of each iteration.
 
     The learner is policy parameters and `optimizer.init` of them. A gradient with a non-finite entry changes nothing.
     """
 
-    def step(carry: tuple[Learner, Scenarios], i: Array) -> tuple[tuple[Learner, Scenarios], SearchInfo]:
+    def step(carry: tuple[TrainState, Scenarios], i: Array) -> tuple[tuple[TrainState, Scenarios], SearchInfo]:
         learner, scenarios = carry
         value, gradient = jax.value_and_grad(objective)(learner.params, posterior, scenarios)
         finite = is_finite(gradient)
         updates, state = update_if(finite, optimizer, gradient, learner, value=value)
-        learner = Learner(optax.apply_updates(learner.params, updates), state)
+        learner = TrainState(optax.apply_updates(learner.params, updates), state)
         info = SearchInfo(value, optax.tree.norm(gradient), ~finite)
         return (learner, sampler.redraw(key, i + 1, scenarios, posterior)), info
 

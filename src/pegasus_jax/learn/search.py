@@ -12,7 +12,7 @@ from pegasus_jax.imagine.scenarios import Sampler
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.learn.schedule import FRESH, START, STEP, SearchTable, first_rows
 from pegasus_jax.learn.updates import is_finite, update_if
-from pegasus_jax.types import Array, Key, Learner, Params, Searcher
+from pegasus_jax.types import Array, Key, Params, PolicyOptimizer, TrainState
 
 
 class SearchState(NamedTuple):
@@ -34,18 +34,18 @@ class Problem(NamedTuple):
     reset_optimizer: bool = True  # whether each search starts with a new optimizer state
 
 
-def searcher(problem: Problem) -> Searcher:
+def searcher(problem: Problem) -> PolicyOptimizer:
     """The searcher of a problem: its `run` is `search`, its learner's optimizer a `SearchState`."""
 
     def init(params: Params) -> SearchState:
         return SearchState(problem.optimizer.init(params), params, jnp.asarray(jnp.inf, float), jnp.zeros((), bool))
 
-    return Searcher(init, partial(search, problem=problem))
+    return PolicyOptimizer(init, partial(search, problem=problem))
 
 
 def search(
     key: Key,
-    learner: Learner,
+    learner: TrainState,
     posterior: Params,
     *,
     problem: Problem,
@@ -53,7 +53,7 @@ def search(
     first: Array | int = 0,
     earlier: Array | int = 0,
     fresh: Params | None = None,
-) -> tuple[Learner, SearchInfo]:
+) -> tuple[TrainState, SearchInfo]:
     """The rows of iterations first .. first + steps - 1 of the problem's table, in the search after `earlier` others.
 
     One call of n steps and two calls of n/2, the second with first=n/2, do the same. `fresh` is the policy that a table
@@ -86,7 +86,7 @@ def search(
     params, state = learner
     optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
     begins, new = jnp.asarray(first) == 0, state._replace(optimizer=optimizer, start=params)
-    learner = Learner(params, optax.tree.where(begins, new, state))
+    learner = TrainState(params, optax.tree.where(begins, new, state))
     scenarios, none = sampler.draw(key, jnp.asarray(first, jnp.int32), posterior), jnp.full(steps, jnp.nan)
     learner, _, info = jax.lax.fori_loop(0, count, visit, (learner, scenarios, SearchInfo(none, none, jnp.int32(0))))
     return learner, info
@@ -100,17 +100,17 @@ def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
 
 
 def after(
-    row: SearchTable, learner: Learner, visited: Params, value: Array, gradient: Params, problem: Problem
-) -> tuple[Learner, Array, Array]:
+    row: SearchTable, learner: TrainState, visited: Params, value: Array, gradient: Params, problem: Problem
+) -> tuple[TrainState, Array, Array]:
     """What a row makes of the cost and gradient of what it visited -> (learner, cost of its parameters, skipped)."""
     (params, state), finite, steps_now = learner, is_finite(gradient), row.action == STEP
     # NaN decides for the older policy, a tie for the other one: where the cost is flat, nothing else leads away.
     older = ~(state.last < value)
     taken = jnp.stack([True, (value <= state.last) | state.no_improvement, older, older])[row.candidate] | steps_now
     params = optax.tree.where(taken, visited, params)
-    now = Learner(params, state.optimizer)
+    now = TrainState(params, state.optimizer)
     updates, moved = update_if(steps_now & finite, problem.optimizer, gradient, now, value=value)
     start = optax.tree.where(row.candidate >= START, params, state.start)
     found = SearchState(moved, start, value, jnp.where(row.candidate == START, taken, state.no_improvement))
     params = optax.apply_updates(params, optax.tree.scale(row.step_size, updates))
-    return Learner(params, found), jnp.where(taken, value, state.last), steps_now & ~finite
+    return TrainState(params, found), jnp.where(taken, value, state.last), steps_now & ~finite

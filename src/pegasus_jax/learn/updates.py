@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from pegasus_jax.types import Array, Learner, Params
+from pegasus_jax.types import Array, Params, TrainState
 
 
 def is_finite(gradient: Params) -> Array:
@@ -15,7 +15,7 @@ def is_finite(gradient: Params) -> Array:
 
 
 def update_if(
-    condition: Array, optimizer: optax.GradientTransformation, gradient: Params, learner: Learner, **more: Any
+    condition: Array, optimizer: optax.GradientTransformation, gradient: Params, learner: TrainState, **more: Any
 ) -> tuple[Params, optax.OptState]:
     """The optimizer's updates and its next state; where the condition does not hold zeros, and its state as it is.
 

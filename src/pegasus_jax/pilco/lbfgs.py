@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import optax
 
 from pegasus_jax.learn.fit import FitInfo
-from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Fitter, Key, Learner, Params
+from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, ModelLearner, Params, TrainState
 
 MEMORY = 10  # past steps from which the curvature is known
 
@@ -68,7 +68,7 @@ def minimize(function: Callable[[Params], Array], params: Params, steps: int) ->
     )
 
 
-def full_data(dynamics: Dynamics, *, num_starts: int) -> Fitter:
+def full_data(dynamics: Dynamics, *, num_starts: int) -> ModelLearner:
     """The fitter that minimizes the loss over all rows at once, from the best of several starts.
 
     The starts are the current parameters and `num_starts` draws of `dynamics.init`. The loss must be a function of
@@ -76,7 +76,7 @@ def full_data(dynamics: Dynamics, *, num_starts: int) -> Fitter:
     but the parameters is carried from one fit to the next.
     """
 
-    def run(key: Key, learner: Learner, data: Dataset, steps: int) -> tuple[Learner, FitInfo]:
+    def run(key: Key, learner: TrainState, data: Dataset, steps: int) -> tuple[TrainState, FitInfo]:
         init_key, loss_key = jax.random.split(key)
         context = dynamics.prepare(data)
 
@@ -89,6 +89,6 @@ def full_data(dynamics: Dynamics, *, num_starts: int) -> Fitter:
         losses = jax.lax.map(loss, candidates)
         best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))
         found = minimize(loss, jax.tree.map(lambda leaf: leaf[best], candidates), steps)
-        return Learner(found.params, learner.optimizer), FitInfo(found.value, losses[best], found.skipped)
+        return TrainState(found.params, learner.optimizer), FitInfo(found.value, losses[best], found.skipped)
 
-    return Fitter(lambda params: (), run)
+    return ModelLearner(lambda params: (), run)

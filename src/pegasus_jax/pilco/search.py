@@ -17,7 +17,7 @@ from pegasus_jax.imagine.rollout import NoiseUse
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.math.gaussian import Image, chain, joint, residual, sincos
 from pegasus_jax.pilco import lbfgs
-from pegasus_jax.types import Array, Cost, Dynamics, Key, Learner, Params, Policy, Searcher
+from pegasus_jax.types import Array, Cost, Dynamics, Key, Params, Policy, PolicyOptimizer, TrainState
 
 
 class Gaussians(NamedTuple):
@@ -108,7 +108,7 @@ def analytic(
     objective: Callable[[Params, Params, Array], Array],
     noise_std: Callable[[Key, Params], Array],
     restart: bool = False,
-) -> Searcher:
+) -> PolicyOptimizer:
     """The searcher that minimizes `objective(policy parameters, posterior, std)` by L-BFGS, as far as that goes.
 
     `noise_std(key, posterior)` is the model's noise std [D]. With `restart` a search starts from its fresh policy where
@@ -118,14 +118,14 @@ def analytic(
 
     def run(
         key: Key,
-        learner: Learner,
+        learner: TrainState,
         posterior: Params,
         *,
         first: Array | int,
         steps: int,
         fresh: Params | None = None,
         **_: Any,
-    ) -> tuple[Learner, SearchInfo]:
+    ) -> tuple[TrainState, SearchInfo]:
         std = noise_std(key, posterior)
 
         def value(params: Params) -> Array:
@@ -150,6 +150,6 @@ def analytic(
 
         descent = optax.tree.where(new, lbfgs.begin(learner.params), learner.optimizer)
         after, (values, norms) = jax.lax.scan(iterate, descent, None, steps)
-        return Learner(after.params, after), SearchInfo(values, norms, after.skipped - descent.skipped)
+        return TrainState(after.params, after), SearchInfo(values, norms, after.skipped - descent.skipped)
 
-    return Searcher(lbfgs.begin, run)
+    return PolicyOptimizer(lbfgs.begin, run)

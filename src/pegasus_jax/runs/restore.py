@@ -24,7 +24,7 @@ from pegasus_jax.config import Config
 from pegasus_jax.episode import verdict
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.runs import checkpoint, config_io, facts, store
-from pegasus_jax.types import Learner, RunState, Task
+from pegasus_jax.types import RunState, Task, TrainState
 
 Trial = int | str  # a number, or one of:
 LAST, BEST = "last", "best"
@@ -104,7 +104,7 @@ def newest(runs: Sequence[Path], like: RunState, candidates: Sequence[int]) -> t
 def _stacked(states: Sequence[RunState]) -> RunState:
     """One state [S, ...] of many; an optimizer that one of them lacks, all lack."""
 
-    def learner(name: str, state: RunState) -> Learner:
+    def learner(name: str, state: RunState) -> TrainState:
         lacking = any(getattr(other, name).optimizer is None for other in states)
         return getattr(state, name)._replace(optimizer=None) if lacking else getattr(state, name)
 
@@ -141,7 +141,7 @@ def suited(states: RunState, fresh: RunState) -> RunState:
     def shape(tree: Any) -> tuple[Any, list[Any]]:
         return jax.tree.structure(tree), jax.tree.map(jnp.shape, jax.tree.leaves(tree))
 
-    def learner(old: Learner, new: Learner) -> Learner:
+    def learner(old: TrainState, new: TrainState) -> TrainState:
         same = shape(old.optimizer) == shape(new.optimizer)
         return old if same else old._replace(optimizer=new.optimizer)
 
