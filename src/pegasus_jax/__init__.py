@@ -8,55 +8,77 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pegasus_jax import config, tasks
-    from pegasus_jax.assembly.experiments import build, compose
-    from pegasus_jax.assembly.pieces import dynamics_of, policy_of
-    from pegasus_jax.checks import ConfigError, RunError
-    from pegasus_jax.config import Config
-    from pegasus_jax.episode import Episode
-    from pegasus_jax.experiment import Experiment, Successor, TrialInfo, run, trial
-    from pegasus_jax.exports.write import export
-    from pegasus_jax.imagine import costs, matching
-    from pegasus_jax.imagine.objective import objective
-    from pegasus_jax.imagine.rollout import NoiseUse, rollout
-    from pegasus_jax.imagine.scenarios import Blocks, Sampler, blocks, draw, sampler
-    from pegasus_jax.learn import data
-    from pegasus_jax.learn.fit import FitInfo, fit, minibatches
-    from pegasus_jax.learn.gradient import SearchInfo, gradient_search
-    from pegasus_jax.learn.schedule import SearchTable, search_table
-    from pegasus_jax.learn.search import Problem, SearchState, search, searcher
-    from pegasus_jax.math import angles, gaussian
-    from pegasus_jax.models import dropout as dropouts
-    from pegasus_jax.models.bnn import bnn
-    from pegasus_jax.models.ensemble import ensemble
-    from pegasus_jax.models.lagrangian import lagrangian
-    from pegasus_jax.pilco.gp import gp
-    from pegasus_jax.pilco.rbf import rbf
-    from pegasus_jax.pilco.ssgp import ssgp
-    from pegasus_jax.policies.linear import linear
-    from pegasus_jax.policies.mlp import mlp
-    from pegasus_jax.policies.wrap import of_pair
-    from pegasus_jax.runs.controller import Controller, controller
-    from pegasus_jax.runs.start import preset, train
-    from pegasus_jax.types import (
-        Batch,
-        Cost,
-        Dataset,
-        Dropout,
-        Dynamics,
-        ModelLearner,
-        Period,
-        Policy,
-        PolicyOptimizer,
-        Prediction,
-        Rollout,
-        RunState,
-        Scenarios,
-        Task,
-        TrainState,
-        Trajectory,
-    )
-    from pegasus_jax.vectorized import Vectorized
+    from pegasus_jax import config as config
+    from pegasus_jax import tasks as tasks
+    from pegasus_jax.assembly.experiments import build as build
+    from pegasus_jax.assembly.experiments import compose as compose
+    from pegasus_jax.assembly.pieces import dynamics_of as dynamics_of
+    from pegasus_jax.assembly.pieces import policy_of as policy_of
+    from pegasus_jax.checks import ConfigError as ConfigError
+    from pegasus_jax.checks import RunError as RunError
+    from pegasus_jax.config import Config as Config
+    from pegasus_jax.episode import Episode as Episode
+    from pegasus_jax.experiment import Experiment as Experiment
+    from pegasus_jax.experiment import Successor as Successor
+    from pegasus_jax.experiment import TrialInfo as TrialInfo
+    from pegasus_jax.experiment import run as run
+    from pegasus_jax.experiment import trial as trial
+    from pegasus_jax.exports.write import export as export
+    from pegasus_jax.imagine import costs as costs
+    from pegasus_jax.imagine import matching as matching
+    from pegasus_jax.imagine.objective import objective as objective
+    from pegasus_jax.imagine.rollout import NoiseUse as NoiseUse
+    from pegasus_jax.imagine.rollout import rollout as rollout
+    from pegasus_jax.imagine.scenarios import Blocks as Blocks
+    from pegasus_jax.imagine.scenarios import Sampler as Sampler
+    from pegasus_jax.imagine.scenarios import blocks as blocks
+    from pegasus_jax.imagine.scenarios import draw as draw
+    from pegasus_jax.imagine.scenarios import sampler as sampler
+    from pegasus_jax.learn import data as data
+    from pegasus_jax.learn.fit import FitInfo as FitInfo
+    from pegasus_jax.learn.fit import fit as fit
+    from pegasus_jax.learn.fit import minibatches as minibatches
+    from pegasus_jax.learn.gradient import SearchInfo as SearchInfo
+    from pegasus_jax.learn.gradient import gradient_search as gradient_search
+    from pegasus_jax.learn.schedule import SearchTable as SearchTable
+    from pegasus_jax.learn.schedule import search_table as search_table
+    from pegasus_jax.learn.search import Problem as Problem
+    from pegasus_jax.learn.search import SearchState as SearchState
+    from pegasus_jax.learn.search import search as search
+    from pegasus_jax.learn.search import searcher as searcher
+    from pegasus_jax.math import angles as angles
+    from pegasus_jax.math import gaussian as gaussian
+    from pegasus_jax.models import dropout as dropouts  # noqa: F401
+    from pegasus_jax.models.bnn import bnn as bnn
+    from pegasus_jax.models.ensemble import ensemble as ensemble
+    from pegasus_jax.models.lagrangian import lagrangian as lagrangian
+    from pegasus_jax.pilco.gp import gp as gp
+    from pegasus_jax.pilco.rbf import rbf as rbf
+    from pegasus_jax.pilco.ssgp import ssgp as ssgp
+    from pegasus_jax.policies.linear import linear as linear
+    from pegasus_jax.policies.mlp import mlp as mlp
+    from pegasus_jax.policies.wrap import of_pair as of_pair
+    from pegasus_jax.runs.controller import Controller as Controller
+    from pegasus_jax.runs.controller import controller as controller
+    from pegasus_jax.runs.start import preset as preset
+    from pegasus_jax.runs.start import train as train
+    from pegasus_jax.types import Batch as Batch
+    from pegasus_jax.types import Cost as Cost
+    from pegasus_jax.types import Dataset as Dataset
+    from pegasus_jax.types import Dropout as Dropout
+    from pegasus_jax.types import Dynamics as Dynamics
+    from pegasus_jax.types import ModelLearner as ModelLearner
+    from pegasus_jax.types import Period as Period
+    from pegasus_jax.types import Policy as Policy
+    from pegasus_jax.types import PolicyOptimizer as PolicyOptimizer
+    from pegasus_jax.types import Prediction as Prediction
+    from pegasus_jax.types import Rollout as Rollout
+    from pegasus_jax.types import RunState as RunState
+    from pegasus_jax.types import Scenarios as Scenarios
+    from pegasus_jax.types import Task as Task
+    from pegasus_jax.types import TrainState as TrainState
+    from pegasus_jax.types import Trajectory as Trajectory
+    from pegasus_jax.vectorized import Vectorized as Vectorized
 
 # Module -> its public names, in the order in which a reader needs them.
 _NAMES = {
@@ -68,8 +90,8 @@ _NAMES = {
     "experiment": "run trial Experiment Successor TrialInfo",
     "checks": "ConfigError RunError",
     "runs.controller": "controller Controller",
-    "episode": "Episode",
     "exports.write": "export",
+    "episode": "Episode",
     # the method, function by function
     "imagine.scenarios": "blocks Blocks draw sampler Sampler",
     "imagine.rollout": "rollout NoiseUse",
@@ -107,79 +129,7 @@ _FAMILIES = {
 _RENAMED = {"Learner": "TrainState", "Fitter": "ModelLearner", "Searcher": "PolicyOptimizer"}
 _MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
 
-__all__ = [
-    "Batch",
-    "Blocks",
-    "Config",
-    "ConfigError",
-    "Controller",
-    "Cost",
-    "Dataset",
-    "Dropout",
-    "Dynamics",
-    "Episode",
-    "Experiment",
-    "FitInfo",
-    "ModelLearner",
-    "NoiseUse",
-    "Period",
-    "Policy",
-    "PolicyOptimizer",
-    "Prediction",
-    "Problem",
-    "Rollout",
-    "RunError",
-    "RunState",
-    "Sampler",
-    "Scenarios",
-    "SearchInfo",
-    "SearchState",
-    "SearchTable",
-    "Successor",
-    "Task",
-    "TrainState",
-    "Trajectory",
-    "TrialInfo",
-    "Vectorized",
-    "angles",
-    "blocks",
-    "bnn",
-    "build",
-    "compose",
-    "config",
-    "controller",
-    "costs",
-    "data",
-    "draw",
-    "dropouts",
-    "dynamics_of",
-    "ensemble",
-    "export",
-    "fit",
-    "gaussian",
-    "gp",
-    "gradient_search",
-    "lagrangian",
-    "linear",
-    "matching",
-    "minibatches",
-    "mlp",
-    "objective",
-    "of_pair",
-    "policy_of",
-    "preset",
-    "rbf",
-    "rollout",
-    "run",
-    "sampler",
-    "search",
-    "search_table",
-    "searcher",
-    "ssgp",
-    "tasks",
-    "train",
-    "trial",
-]
+__all__ = sorted((*_MODULES, *_FAMILIES))  # pyright: ignore[reportUnsupportedDunderAll]
 
 
 def __getattr__(name: str) -> Any:

@@ -3,7 +3,8 @@
 import dataclasses
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -128,14 +129,9 @@ def resolve(config: Config) -> Config:
         _complete(config)
         environment(config)
         given = {name: getattr(config, name) for name in EnvSpec._fields}
-        try:
+        what = f"env={config.env}"
+        with user_code.blamed(what), _refused(what):
             known = env_spec(config.env or "", config.env_args, **given)
-        except ValueError as error:
-            raise ConfigError(f"env={config.env}: {' '.join(str(error).split())}") from error
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:
-            raise ConfigError(f"env={config.env}: {user_code.told(error)}") from error
         plain: dict[str, Any] = {
             name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in known._asdict().items()
         }
@@ -221,10 +217,8 @@ def compared(config: Config, task: Task) -> None:
     if config.task == MJCF:
         from pegasus_envs import mjcf_check
 
-        try:
+        with _refused(f"mjcf={config.mjcf}"):
             mjcf_check.compare(task.plant)
-        except ValueError as error:
-            raise ConfigError(f"mjcf={config.mjcf}: {error}") from error
 
 
 def described(config: Config) -> dict[str, str]:
@@ -273,12 +267,10 @@ def from_mjcf(config: Config) -> Task:
         )
     from pegasus_envs import mjcf_plant
 
-    model = _model(config)
     names = ("observe", "control_low", "control_high", "start_mean", "start_std")
-    try:
+    with _refused(f"mjcf={config.mjcf}"):
+        model = mjcf_plant.read(Path(config.mjcf or ""))
         plant = mjcf_plant.mechanism(model, config.dt or 0.0, **{name: getattr(config, name) for name in names})
-    except ValueError as error:
-        raise ConfigError(f"mjcf={config.mjcf}: {error}") from error
     name = Path(config.mjcf or "").stem
     task = _of_users(config, name, plant, plant, config.horizon or 0, plant.state_names, plant.control_names)
     return task._replace(rates=plant.rates)
@@ -293,13 +285,13 @@ def mjcf_digest(task: Task) -> str | None:
     return mjcf_plant.digest(task.plant.model) if isinstance(task.plant, mjcf_plant.Mechanism) else None
 
 
-def _model(config: Config) -> Any:
-    from pegasus_envs import mjcf_plant
-
+@contextmanager
+def _refused(what: str) -> Iterator[None]:
+    """Turns a ValueError raised within into a ConfigError of one line: `what`, and its message."""
     try:
-        return mjcf_plant.read(Path(config.mjcf or ""))
+        yield
     except ValueError as error:
-        raise ConfigError(f"mjcf={config.mjcf}: {error}") from error
+        raise ConfigError(f"{what}: {' '.join(str(error).split())}") from error
 
 
 def _of_users(
