@@ -24,6 +24,8 @@ def watched() -> None:
     """`pegasus-train` in this process, whose parts are timed; ends it after the first part of a search."""
     began, words = float(os.environ[STARTED]), sys.argv[1:]
     from pegasus_jax.cli import main as cli
+
+    cli._remember_compilations()  # as the command does, before the next line imports JAX
     from pegasus_jax.runs import programs
 
     run, spent = programs.Program.__call__, {}
