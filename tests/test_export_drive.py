@@ -135,6 +135,7 @@ def test_a_robot_is_driven_by_the_policy_at_its_period(home: Path) -> None:
     assert int(log["overruns"]) == overruns(log["time"], 0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["gently", "deaf"])
 def test_a_robot_that_hangs_is_closed_and_its_rows_are_kept(home: Path, how: str) -> None:
     """Where Ctrl-C would end the hanging call, and where nothing does: then the process ends."""
@@ -151,7 +152,7 @@ def test_a_robot_that_hangs_is_closed_and_its_rows_are_kept(home: Path, how: str
     assert np.isfinite(log["cost"]).all()
 
 
-@pytest.mark.parametrize(("where", "rows"), [("step", 3), ("reset", 0)])
+@pytest.mark.parametrize(("where", "rows"), [pytest.param("step", 3, marks=pytest.mark.slow), ("reset", 0)])
 def test_a_robot_that_fails_is_closed_and_its_rows_are_kept(home: Path, where: str, rows: int) -> None:
     before = len([*(home / "run").glob("driven/*.npz")])
     done = driven(home, BREAKS=where)
@@ -163,6 +164,7 @@ def test_a_robot_that_fails_is_closed_and_its_rows_are_kept(home: Path, where: s
     assert not rows or len(newest(home)["u"]) == rows
 
 
+@pytest.mark.slow
 def test_ctrl_c_closes_the_robot_and_its_rows_are_kept(home: Path) -> None:
     done = driven(home, "seconds=60", stopped=signal.SIGINT)
     assert (done.code, done.asked) == (130, ["reset", "close"])
