@@ -199,6 +199,9 @@ def test_a_file_that_is_there_is_kept(runs: dict[str, Path], tmp_path: Path) -> 
         ({"out": "my-arm.py"}, r"out=my-arm.py is no name for format=numpy; the nearest is out=my_arm.py"),
         ({"out": "arm.py", "format": "c"}, "out=arm.py is no name for format=c; the nearest is out=arm.h"),
         ({"out": "2.h", "format": "c"}, "the nearest is out=_2.h"),
+        ({"out": "class.py"}, "the nearest is out=class_.py"),
+        ({"out": "numpy.py"}, "the nearest is out=numpy_.py"),
+        ({"out": "math.h", "format": "c"}, "the nearest is out=math_.h"),
         ({"trial": 9}, "has no checkpoint of trial=9; choose from 1, 2, best, last"),
     ],
 )

@@ -2,9 +2,11 @@
 
 import re
 import shlex
+import sys
 import tempfile
 from collections.abc import Callable
 from functools import partial
+from keyword import iskeyword
 from pathlib import Path
 from typing import NamedTuple
 
@@ -78,8 +80,10 @@ def destination(run: Path, format: str, out: str | Path | None, overwrite: bool)
     """The file to write. Raises ConfigError for a name that cannot be, or a file that is there."""
     suffix = FORMATS[format].suffix
     file = run / f"controller{suffix}" if out is None else Path(out)
-    # The name is that of a module, and of C functions.
-    right = Path(re.sub(r"^(?=\d)|\W", "_", file.stem, flags=re.ASCII) or "controller").with_suffix(suffix)
+    # The name is that of a module, and of C functions; that of another module or header would hide it.
+    name = re.sub(r"^(?=\d)|\W", "_", file.stem, flags=re.ASCII) or "controller"
+    taken = iskeyword(name) or name in ("numpy", *sys.stdlib_module_names)
+    right = Path(f"{name}_" if taken else name).with_suffix(suffix)
     if file.name != right.name:
         raise ConfigError(f"out={out} is no name for format={format}; the nearest is out={file.with_name(right.name)}")
     for path in (file, contract_of(file)):
