@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from shutil import which
 
 import numpy as np
 import pytest
@@ -105,6 +106,8 @@ int main(void) {{ {real}[ARM_OBSERVATIONS] = {{0}}, u[ARM_CONTROLS]; arm_reset()
     words = ["cc", "-std=c99", *STRICT, str(tmp_path / "main.c"), "-o", str(tmp_path / "main"), "-lm"]
     subprocess.run(words, check=True)
     subprocess.run([str(tmp_path / "main")], check=True)
+    if which("c++"):  # firmware is often in C++
+        subprocess.run(["c++", "-Wall", "-Wextra", "-Werror", "-fsyntax-only", str(tmp_path / "main.c")], check=True)
 
 
 def test_a_runtime_of_onnx_takes_a_batch(run: Path, u: np.ndarray, tmp_path: Path) -> None:

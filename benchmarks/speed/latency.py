@@ -2,10 +2,10 @@
 
     python -m benchmarks.speed.latency [setting=value ...]
 
-Learns for two short trials on an environment that answers at once and notes when it is called. Writes
-benchmarks/results/latency.json: microseconds (median, 99th percentile, most) between the return of the environment's
-`step` and its next call, of one call of `controller`, and of one call of each file that `export` writes (C from C, the
-others from Python).
+Learns for two short trials on an environment that answers at once and notes when it is called. Writes microseconds
+(median, 99th percentile, most): benchmarks/results/latency.json, between the return of the environment's `step` and its
+next call, and of one call of `controller`; benchmarks/results/latency_exports.json, of one call of each file that
+`export` writes, C from C, the others from Python.
 """
 
 import json
@@ -130,11 +130,13 @@ def main(words: list[str]) -> None:
     with tempfile.TemporaryDirectory() as folder:
         run = Path(folder) / "run"
         train(config, run)
-        seconds = {"between steps": gaps, "controller": calls(controller(run), np.zeros(4)), **exported(run)}
-    row = {name: microseconds(found) for name, found in seconds.items()}
+        ours = {"between steps": gaps, "controller": calls(controller(run), np.zeros(4))}
+        found = {"latency": ours, "latency_exports": exported(run)}
     command = shlex.join(["python", "-m", "benchmarks.speed.latency", *words])
-    (RESULTS / "latency.json").write_text(json.dumps({"rows": row, "about": about(command)}, indent=1) + "\n")
-    print(json.dumps(row))
+    for name, seconds in found.items():
+        rows = {what: microseconds(times) for what, times in seconds.items()}
+        (RESULTS / f"{name}.json").write_text(json.dumps({"rows": rows, "about": about(command)}, indent=1) + "\n")
+        print(json.dumps(rows))
 
 
 if __name__ == "__main__":
