@@ -24,6 +24,7 @@ from pegasus_jax.runs.display import summary
 from pegasus_jax.runs.evaluation import evaluate, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
 from pegasus_jax.runs.programs import gather, is_main_process
+from pegasus_jax.runs.stuck import stuck
 from pegasus_jax.runs.writers import Row, part
 from pegasus_jax.types import RunState, Trajectory
 
@@ -99,10 +100,13 @@ def learn(job: Job, states: RunState, done: int = 0) -> RunState:
     Raises RunError where the job's writer does not go on after a problem; an episode that was kept is never lost.
     """
     job.writer.begin(done)
+    before: list[Row] = []
     for trial in range(done + 1, job.config.trials + 1):
         states, rows = one_trial(job, states, trial)
         job.writer.trial(trial, states, rows)
-        job.display.line(summary(rows, job.config.trials))
+        for line in (summary(rows, job.config.trials), *stuck(before, rows)):
+            job.display.line(line)
+        before = rows
     return states
 
 

@@ -1,0 +1,59 @@
+"""A policy at its limits is named, with what may be in the way; one that works, or explores, is not."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from pegasus_jax.runs import train, writers
+from pegasus_jax.runs.stuck import stuck
+
+FIRST: dict[str, Any] = {
+    "trial": 4,
+    "random": False,
+    "saturated": 1.0,
+    "episode_cost": 0.98,
+    "objective_fresh": 0.97,
+}
+SECOND = FIRST | {"trial": 5, "saturated": 0.96, "episode_cost": 0.96}
+
+
+def test_a_flat_cost_and_a_wrong_model_are_told_apart() -> None:
+    (flat,), (wrong,) = stuck([FIRST], [SECOND]), stuck([FIRST | {"objective_fresh": 0.3}], [SECOND])
+    for line in (flat, wrong):
+        assert line.startswith("note: the controls of trials 4 and 5 were at their limits")
+        assert "(cost 0.96)" in line
+    assert "the cost may be flat" in flat
+    assert "imagined was 0.30: the model is wrong there" in wrong
+
+
+@pytest.mark.parametrize("change", [{"random": True}, {"saturated": 0.94}, {"episode_cost": 0.4}])
+@pytest.mark.parametrize("which", [0, 1])
+def test_nothing_is_said_of_random_gentle_or_working_controls(change: dict[str, Any], which: int) -> None:
+    rows = [FIRST, SECOND]
+    rows[which] = rows[which] | change
+    assert stuck([rows[0]], [rows[1]]) == []
+
+
+def test_nothing_is_said_of_a_first_trial_or_of_several_seeds() -> None:
+    assert stuck([], [FIRST]) == []
+    assert stuck([FIRST, FIRST], [SECOND, SECOND]) == []
+
+
+def test_a_run_says_it_once_for_each_two_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = iter([FIRST | {"trial": 1, "random": True}, *(FIRST | {"trial": trial} for trial in (2, 3, 4))])
+    monkeypatch.setattr(train, "one_trial", lambda job, states, trial: (states, [next(rows)]))
+    monkeypatch.setattr(train, "summary", lambda rows, trials: f"trial {rows[0]['trial']}")
+    said: list[str] = []
+    job = SimpleNamespace(
+        writer=writers.nothing(1), config=SimpleNamespace(trials=4), display=SimpleNamespace(line=said.append)
+    )
+    train.learn(cast(Any, job), cast(Any, None))
+    assert [line[:40] for line in said] == [
+        "trial 1",
+        "trial 2",
+        "trial 3",
+        "note: the controls of trials 2 and 3 wer",
+        "trial 4",
+        "note: the controls of trials 3 and 4 wer",
+    ]
