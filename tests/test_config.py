@@ -92,7 +92,7 @@ IMPOSSIBLE = [
     (
         Search,
         dict(standardized_noise="no"),
-        "search.standardized_noise=no is not true or false; for example search.standardized_noise=true",
+        "search.standardized_noise=no is not true or false; for example search.standardized_noise=false",
     ),
     (Search, dict(grad_clip="none"), "search.grad_clip=none is not a number or null"),
     (Search, dict(steps=10**20), "the nearest is 10000000"),

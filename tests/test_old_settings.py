@@ -50,7 +50,7 @@ OLD = {
     "fit.starts": (4, "model=ssgp fit.num_starts=4"),
     "search.clip": (None, "search.grad_clip=null"),
     "search.match": (False, "search.matching=never"),
-    "search.moment_matching": (True, "search.matching=always"),
+    "search.moment_matching": (False, "search.matching=never"),
     "search.balanced": (False, "search.standardized_noise=false"),
     "search.cost": ("particles", "search.cost_estimator=particles"),
     "search.refine": (0.3, "search.refine_fraction=0.3"),
