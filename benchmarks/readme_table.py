@@ -1,9 +1,10 @@
-"""The tables of what each preset learns: README.md's, and that of docs/results.md by trial. Both are generated.
+"""The generated tables: what each preset learns (README.md's, and docs/results.md's by trial), and peers' speed.
 
 A row is a preset and the stored studies that measured it. The settings in which these studies differ from the preset
 are computed from the stored configs, so that a row cannot claim a preset that nobody measured.
 """
 
+import json
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,6 +62,23 @@ ROWS = (
 MORE = (Row("cart-pole, four policies, on a GPU", "cartpole", ("cartpole-four_policies",)),)
 
 
+class Peer(NamedTuple):
+    """Another program's part, and where our time over its time is: the file of `benchmarks.peers.compare`, the key."""
+
+    name: str
+    file: str
+    key: str
+
+
+PEERS = (
+    Peer("the same search step in PyTorch, `torch.compile`", "peers", "ours_of_compiled"),
+    Peer("the authors' PyTorch program, prob_mbrl: a search step", "peers-prob_mbrl", "ours_of_prob_mbrl"),
+    Peer("prob_mbrl: a fit step, with other noise on the units", "peers-prob_mbrl", "ours_of_prob_mbrl_fit"),
+    Peer("MC-PILCO's search step, ours in float32", "peers-mc_pilco", "ours_of_mc_pilco"),
+    Peer("MC-PILCO's search step, both in float64", "peers-mc_pilco", "ours_double_of_mc_pilco"),
+)
+
+
 def pooled(row: Row, out: Path) -> Result:
     """The studies of a row as one, over all their seeds. Raises ValueError where their configs differ."""
     parts = [found for stem in row.studies if (found := read(out, stem)) is not None]
@@ -96,6 +114,14 @@ def spans(seeds: list[int]) -> str:
 def readme_table(out: Path) -> str:
     """README.md's table of results, from the studies in `out`."""
     return claims.markdown([README_HEADER, *(readme_row(row, pooled(row, out)) for row in ROWS)])
+
+
+def peers_table(out: Path) -> str:
+    """README.md's comparison: our seconds over another program's, for the sizes that every peer was timed at."""
+    files = {peer.file: json.loads((out / f"{peer.file}.json").read_text())["rows"] for peer in PEERS}
+    sizes = [size for size in files["peers"] if all(size in rows for rows in files.values())]
+    lines = [[peer.name, *(f"{files[peer.file][size][peer.key]:.2f}" for size in sizes)] for peer in PEERS]
+    return claims.markdown([["our time over theirs", *sizes], *lines])
 
 
 def readme_row(row: Row, result: Result) -> list[str]:

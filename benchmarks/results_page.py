@@ -1,4 +1,4 @@
-"""What the stored results show: README.md's table of results, and docs/results.md with every figure and its claims.
+"""What the stored results show: README.md's tables, and docs/results.md with every figure and its claims.
 
     python -m benchmarks.results_page
 
@@ -38,7 +38,7 @@ def write(path: Path, generated: str) -> None:
 
 def readme(out: Path) -> str:
     """The generated part of README.md."""
-    return f"\n{readme_table.readme_table(out)}\n\n"
+    return f"\n{readme_table.readme_table(out)}\n\n{readme_table.peers_table(out)}\n\n"
 
 
 def page(folder: Path, out: Path) -> str:

@@ -195,6 +195,10 @@ def test_method_commands_are_settings(command: str) -> None:
     parse(settings)
 
 
+def test_the_first_page_is_short() -> None:
+    assert len((ROOT / "README.md").read_text().splitlines()) <= 120
+
+
 def test_every_block_is_a_program_a_file_or_commands() -> None:
     for page in PAGES:
         for block in blocks(page):
