@@ -96,10 +96,8 @@ def swimmer(maneuver: str, legs: int) -> Config:
 
 
 # A cost of one's own has no width to widen; its expectation is a mean over nodes: docs/decisions/0018. A plant of one's
-# own starts anywhere, 0024, and runs for longer than is imagined, 0023.
-_OWN_PLANT = Search(
-    cost_width_start=1.0, standardized_noise=True, refine_fraction=0.5, matching="narrow", visited_starts=0.5
-)
+# own may start anywhere: 0024.
+_OWN_PLANT = Search(cost_width_start=1.0, standardized_noise=True, refine_fraction=0.5, matching="narrow")
 
 _SWIMMERS = {
     **{f"swimmer_{name}": swimmer(name, 2) for name in MANEUVERS},
@@ -125,7 +123,8 @@ PRESETS: dict[str, Config] = {
         search=replace(DOUBLE_CARTPOLE.search, num_starts=8, particles=96, steps=2000),
     ),
     **_SWIMMERS,
-    GYM: Config(task=GYM, search=_OWN_PLANT),
+    # A robot runs a new policy only where it is expected to be better than the one before.
+    GYM: Config(task=GYM, search=_OWN_PLANT, successor="better"),
     MJCF: Config(task=MJCF, search=_OWN_PLANT),
     **NETWORKS,
 }
