@@ -205,13 +205,15 @@ def _() -> Any:
     return controls
 
 
-@example("blocks", "draw", "rollout", "matching.match", "matching.keep")
+@example("blocks", "draw", "rollout", *(f"matching.{name}" for name in pg.matching.__all__ if name != "Match"))
 def _() -> Any:
     x, z = jax.random.normal(key(), (2, K, D))
     assert pg.matching.keep(x, z) is x
     pieces = {**PIECES, "noise": pg.NoiseUse(state=1.0)}
-    found = [pg.rollout(*imagined(), **{**pieces, "match": match}) for match in (pg.matching.match, pg.matching.keep)]
+    matches = (pg.matching.match, pg.matching.keep, pg.matching.narrow(angles=(0,)))
+    found = [pg.rollout(*imagined(), **{**pieces, "match": match}) for match in matches]
     assert all(one.x.shape == (H + 1, K, D) for one in found)
+    assert pg.matching.wide(found[0].x, angles=(0,)).shape == (H + 1,)
     return found
 
 
@@ -271,7 +273,7 @@ def _() -> Any:
     each = pg.costs.of_particles(cost.widen(2.0))(x)
     stopped = pg.costs.until_stop(each, x, lambda x: x[0] > 1, 1.0)
     assert each.shape == stopped.shape == (H, K)
-    assert pg.costs.of_matched(cost)(x).shape == (H, 1)
+    assert pg.costs.of_matched(cost)(x).shape == pg.costs.of_narrow(cost, (0,))(x).shape == (H, 1)
     by_nodes, closed = pg.costs.expected_by_nodes(cost.of_state), pg.costs.expectation(cost)
     return by_nodes(X, jnp.eye(D)), closed(X, jnp.eye(D)), pg.costs.mean(stopped), pg.costs.total(each)
 

@@ -61,6 +61,7 @@ def test_a_seed_among_others_leaves_what_it_leaves_alone(study: Path, tmp_path: 
     assert fingerprint(study / "seed1") != fingerprint(among)
 
 
+@pytest.mark.slow
 def test_evaluation_episodes_cost_the_same_side_by_side() -> None:
     experiment = compose(tiny(), cart())
     params = jax.vmap(experiment.init)(jax.random.split(jax.random.key(1), 2)).policy.params

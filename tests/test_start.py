@@ -37,6 +37,7 @@ def fingerprint(run: Path) -> str:
     return checkpoint.fingerprint(restore.restored(run)[2])
 
 
+@pytest.mark.slow
 def test_python_leaves_what_the_command_leaves(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -62,6 +63,7 @@ def test_python_leaves_what_the_command_leaves(
         pg.train(resume=other, settings={"model.hidden": [5]})
 
 
+@pytest.mark.slow
 def test_a_cost_is_a_function_of_an_observation(tmp_path: Path) -> None:
     """Cosine and sine, though the policy has their angle. The run is read without it, and goes on with it alone."""
     run = pg.train("gym", out=tmp_path / "run", settings=PENDULUM, cost=upright)
