@@ -80,6 +80,7 @@ def test_a_cost_is_a_function_of_an_observation(tmp_path: Path) -> None:
     assert len(store.trials(run)) == 3
 
 
+@pytest.mark.slow
 def test_a_function_that_nobody_can_import_is_refused_in_a_line(tmp_path: Path) -> None:
     run = pg.train("gym", out=tmp_path / "run", settings=PENDULUM | {"trials": 1}, cost=lambda x: upright(x))
     with pytest.raises(

@@ -76,6 +76,7 @@ def test_a_model_that_remembers_predicts_as_before(members):
     assert same(predicted(model), predicted(remembering(model)))
 
 
+@pytest.mark.slow
 def test_a_search_starts_there_and_what_is_imagined_afterwards_does_not():
     task, found = cart(), []
     for share in (0.0, 1.0):
