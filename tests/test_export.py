@@ -27,7 +27,7 @@ from pegasus_jax.tasks.circled import of_angles
 from pegasus_jax.types import Task
 
 FORMATS = ("numpy", "c", "onnx", "stablehlo")
-needs_cc = pytest.mark.skipif(not any(map(as_c.shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler")
+needs_cc = pytest.mark.skipif(not any(map(as_c.shutil.which, as_c.COMPILERS)), reason="needs a C compiler")
 EACH = [pytest.param(name, marks=needs_cc if name == "c" else ()) for name in FORMATS]
 
 

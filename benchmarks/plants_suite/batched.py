@@ -7,49 +7,41 @@ models and searches do, and nothing of what a state is; the suite itself (__main
 """
 
 import sys
+from functools import partial
 from pathlib import Path
 
 import gymnasium
 
 from benchmarks import study
+from benchmarks.plants_suite.plants import task
 from pegasus_jax.checks import did_you_mean
 
 ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
-COSTS = "benchmarks.plants_suite.costs_of_joints"
+of_joints = partial(task, module="costs_of_joints")
 PLANTS: dict[str, tuple[str, ...]] = {
     "pendulum": (
         f"mjcf={Path(__file__).with_name('pendulum.xml')}",
-        f"cost={COSTS}:pendulum",
+        *of_joints(40, "pendulum", angles="[0]"),
         "dt=0.05",
-        "horizon=40",
-        "angles=[0]",
         "start_mean=[3.14159,0]",
         "start_std=[1.8,0.6]",
     ),
     "inverted_pendulum": (
         f"mjcf={ASSETS}/inverted_pendulum.xml",
-        f"cost={COSTS}:inverted_pendulum",
-        f"stop={COSTS}:inverted_pendulum_falls",
+        *of_joints(50, "inverted_pendulum", "inverted_pendulum_falls", angles="[1]"),
         "dt=0.04",
-        "horizon=50",
-        "angles=[1]",
         "start_std=[0.006]",
     ),
     "inverted_double_pendulum": (
         f"mjcf={ASSETS}/inverted_double_pendulum.xml",
-        f"cost={COSTS}:double_pendulum",
-        f"stop={COSTS}:double_pendulum_falls",
+        *of_joints(40, "double_pendulum", "double_pendulum_falls", angles="[1,2]"),
         "dt=0.05",
-        "horizon=40",
-        "angles=[1,2]",
         "start_std=[0.06,0.06,0.06,0.1,0.1,0.1]",
     ),
     "reacher": (
         f"mjcf={ASSETS}/reacher.xml",
-        f"cost={COSTS}:reacher",
+        *of_joints(50, "reacher", angles="[0,1]"),
         "dt=0.02",
-        "horizon=50",
-        "angles=[0,1]",
         "observe=[qpos.0,qpos.1,qpos.2,qpos.3,qvel.0,qvel.1]",
         "start_mean=[0,0,0,0,0,0]",
         "start_std=[0.06,0.06,0.1,0.1,0.003,0.003]",

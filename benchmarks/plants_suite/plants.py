@@ -3,10 +3,10 @@
 from typing import NamedTuple
 
 
-def task(horizon: int, cost: str, stop: str = "", angles: str = "[]") -> tuple[str, ...]:
-    """The words of pegasus-train that describe a task, with functions of costs.py."""
+def task(horizon: int, cost: str, stop: str = "", angles: str = "[]", module: str = "costs") -> tuple[str, ...]:
+    """The words of pegasus-train that describe a task, with functions of costs.py or another module here."""
     named = {"cost": cost, "stop": stop}
-    functions = (f"{setting}=benchmarks.plants_suite.costs:{name}" for setting, name in named.items() if name)
+    functions = (f"{setting}=benchmarks.plants_suite.{module}:{name}" for setting, name in named.items() if name)
     return (f"horizon={horizon}", f"angles={angles}", *functions)
 
 

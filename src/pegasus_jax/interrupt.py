@@ -13,7 +13,8 @@ from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 from typing import Any
 
-SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+# Windows has no SIGHUP.
+SIGNALS = tuple(signal.Signals[n] for n in ("SIGINT", "SIGTERM", "SIGHUP") if n in signal.Signals.__members__)
 
 PAUSE = 0.02  # seconds until a signal whose exception was lost, or could not be raised, is raised again
 LOADING = ("create_module", "exec_module")  # of a loader
@@ -151,7 +152,15 @@ def _unraisable(otherwise: Callable[[Any], object], told: Any) -> None:
 def _repeat(number: int) -> None:
     time.sleep(PAUSE)
     _State.repeated = True
-    signal.pthread_kill(threading.main_thread().ident, number)  # type: ignore[arg-type]
+    to_main_thread(number)
+
+
+def to_main_thread(number: int) -> None:
+    """Raise a signal in the main thread, whatever thread this is: what it waits for in the system is interrupted."""
+    try:
+        signal.pthread_kill(threading.main_thread().ident, number)  # type: ignore[arg-type]
+    except AttributeError:  # Windows has none; Python calls the handler in the main thread all the same
+        signal.raise_signal(number)
 
 
 def _handle(number: int, frame: FrameType | None) -> None:

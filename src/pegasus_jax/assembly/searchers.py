@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,13 +22,32 @@ from pegasus_jax.learn.search import Problem, searcher
 from pegasus_jax.pilco import search as pilco
 from pegasus_jax.policies.scaled import inherited
 from pegasus_jax.sharding import Spread, together
-from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, PolicyOptimizer, Rollout, Scenarios, Task
+from pegasus_jax.types import (
+    Array,
+    Cost,
+    Dynamics,
+    Key,
+    Params,
+    Period,
+    Policy,
+    PolicyOptimizer,
+    Rollout,
+    Scenarios,
+    Task,
+)
 
-# What search.matching names, for a task's angles.
-MATCHES: dict[str, Callable[[tuple[int, ...]], matching.Match]] = {
-    "always": lambda _: matching.match,
-    "narrow": matching.narrow,
-    "never": lambda _: matching.keep,
+
+class Matching(NamedTuple):
+    """What search.matching names, for the angles of a task."""
+
+    particles: Callable[[tuple[int, ...]], matching.Match]  # what becomes of the particles of each step
+    cost: Callable[[Cost, tuple[int, ...]], Callable[[Array], Array]]  # -> costs [H, 1] of states [H, K, D]
+
+
+MATCHINGS = {
+    "always": Matching(lambda _: matching.match, lambda of, _: cost.of_matched(of)),
+    "narrow": Matching(matching.narrow, cost.of_narrow),
+    "never": Matching(lambda _: matching.keep, lambda of, _: cost.of_matched(of)),
 }
 
 # (key, policy parameters, posterior) -> (rollout, cost [H, K])
@@ -59,14 +78,14 @@ def search_of(
     blocks = blocks_of(
         search.particles, task, dynamics, policy, standardized_noise=search.standardized_noise, spread=spread
     )
-    around = jnp.asarray(task.start_mean, float)
-    started = (
-        or_visited(blocks.start, search.visited_starts, task.angles, around) if search.visited_starts else blocks.start
-    )
+    searched = blocks
+    if search.visited_starts:
+        around = jnp.asarray(task.start_mean, float)
+        searched = blocks._replace(start=or_visited(blocks.start, search.visited_starts, task.angles, around))
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
     # A particle's cost is 1 / K of the objective.
     limit = None if (most := search.particle_grad_limit) is None else most / search.particles
-    match = MATCHES[search.matching](task.angles)
+    match = MATCHINGS[search.matching].particles(task.angles)
     costs = costs_of(search, task)
     table = table_of(search)
     # What no row asks for is not compiled.
@@ -86,7 +105,7 @@ def search_of(
 
     clip = optax.identity() if search.grad_clip is None else optax.clip_by_global_norm(search.grad_clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
-    draws = scenarios.sampler(blocks._replace(start=started), Period(**vars(search.period)))
+    draws = scenarios.sampler(searched, Period(**vars(search.period)))
     found = searcher(Problem(value, draws, optimizer, table, search.reset_optimizer))
     if search.num_starts > 1:
         lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
@@ -169,11 +188,10 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
 
     def costs(refining: Array | None, width: Array | None) -> Callable[[Array], Array]:
         now = task.cost if width is None or task.cost.widen is None else task.cost.widen(width)
-        each = cost.of_particles(now)
         if search.cost_estimator != "gaussian":
-            return until_stop(task, each)
-        matched = cost.of_narrow(now, task.angles) if search.matching == "narrow" else cost.of_matched(now)
-        return until_stop(task, either(refining, lambda x: jnp.mean(each(x), 1, keepdims=True), matched))
+            return until_stop(task, cost.of_particles(now))
+        matched = MATCHINGS[search.matching].cost(now, task.angles)
+        return until_stop(task, either(refining, cost.of_particles_mean(now), matched))
 
     return costs
 

@@ -65,6 +65,7 @@ int main(void) {{
 }}
 """
 
+COMPILERS = ("cc", "gcc", "clang")  # the first that is there is taken
 TYPES = {"float32": ("float", "f"), "float64": ("double", "")}  # and the end of the names of its numbers and functions
 
 
@@ -165,7 +166,7 @@ def _table(name: str, array: np.ndarray) -> str:
 
 def compiler() -> list[str]:
     """The command of a C compiler: $CC, or the first of cc, gcc and clang. Raises ConfigError without one."""
-    found = shlex.split(os.environ.get("CC", "")) or [name for name in ("cc", "gcc", "clang") if shutil.which(name)][:1]
+    found = shlex.split(os.environ.get("CC", "")) or [*filter(shutil.which, COMPILERS)][:1]
     if not found or not shutil.which(found[0]):
         raise ConfigError(
             "format=c needs a C compiler to compare the header with the policy, and there is no cc, gcc or clang here"

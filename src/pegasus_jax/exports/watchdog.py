@@ -48,7 +48,7 @@ class Watchdog:
                 return
 
     def _stop(self) -> None:
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+        interrupt.to_main_thread(signal.SIGINT)
         if self._done.wait(GRACE):
             return
         interrupt.let_go(self._close)
