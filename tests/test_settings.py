@@ -183,7 +183,7 @@ def test_a_cost_of_ones_own_is_matched_and_not_widened(words):
         True,
         0.5,
     )
-    assert (chosen.matching, chosen.visited_starts) == ("narrow", 0)  # docs/decisions/0023 and 0024
+    assert (chosen.matching, chosen.visited_starts) == ("narrow", 0.5)  # docs/decisions/0023 and 0024
     assert (
         parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9", "algorithm=paper").search.cost_estimator == "particles"
     )

@@ -334,6 +334,7 @@ def test_a_successor_takes_over_where_it_is_expected_to_cost_less(better, compar
     idle, good = jnp.zeros((1, 2)), jnp.array([[-0.8, -1.2]])
     new, old = (good, idle) if better else (idle, good)
     state = state._replace(policy=state.policy._replace(params=new), trial=jnp.int32(4), policy_trial=jnp.int32(3))
+    state = state._replace(succeeded=jnp.bool_(True))
     after, found = jax.jit(exp.succeed)(state, old)
     replaced = better or compare == "always"
     assert bool(found.replaced) == replaced
@@ -345,6 +346,20 @@ def test_a_successor_takes_over_where_it_is_expected_to_cost_less(better, compar
         # What has never learned anything is no incumbent.
         first, found = jax.jit(exp.succeed)(state._replace(policy_trial=jnp.int32(0)), old)
         assert (int(first.policy_trial), bool(found.replaced)) == (4, True)
+        # Nor is one that failed on the plant, whatever is expected of it.
+        failed, found = jax.jit(exp.succeed)(state._replace(succeeded=jnp.bool_(False)), old)
+        assert same(failed.policy.params, new)
+        assert (int(failed.policy_trial), bool(found.replaced)) == (4, True)
+
+
+@pytest.mark.parametrize(("length", "succeeds"), [(None, True), (8, True), (7, False), (4, False)])
+def test_a_state_says_whether_its_newest_episode_succeeded(watched, looped, length, succeeds):
+    """Of the last five periods those that an early end left out cost `stop_cost`, 1: one of five is .2, a failure."""
+    state, trajectory = looped[0][0], looped[1][0].trajectory
+    length = None if length is None else jnp.int32(length)
+    added = watched.exp.add_episode(state, trajectory._replace(cost=jnp.zeros(8), length=length))
+    assert bool(added.succeeded) == succeeds
+    assert not bool(watched.exp.add_episode(added, trajectory._replace(cost=jnp.ones(8))).succeeded)
 
 
 def test_an_episode_that_is_none_of_the_tasks_is_refused(watched, looped):

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pegasus_jax.assembly.experiments import compose
-from pegasus_jax.imagine.visited import STATES, Visited, or_visited, remembering
+from pegasus_jax.imagine.visited import STATES, Starts, Visited, beside_visited, remembering, started
 from pegasus_jax.models.ensemble import ensemble
-from pegasus_jax.types import Dataset
+from pegasus_jax.types import Dataset, Scenarios
 from pegasus_jax.vectorized import for_particles
 from probes import cart, experience, network, regression, same, tiny
 
@@ -24,8 +24,10 @@ def rows(size, capacity=700):
 
 
 def drawn(share, states, angles=(), around=0.0):
-    start = or_visited(lambda key, given: jnp.full((K, D), -5.0), share, angles, jnp.full(D, around))
-    return np.asarray(start(jax.random.key(0), Visited(None, states)))
+    start = beside_visited(lambda key, given: jnp.full((K, D), -5.0), share, angles, jnp.full(D, around))
+    found = start(jax.random.key(0), Visited(None, states))
+    assert np.array_equal(found.own, np.full((K, D), -5.0))
+    return np.asarray(found.mixed)
 
 
 @pytest.mark.parametrize("size", [1, 7, STATES, 600])
@@ -76,11 +78,17 @@ def test_a_model_that_remembers_predicts_as_before(members):
     assert same(predicted(model), predicted(remembering(model)))
 
 
+@pytest.mark.parametrize("refining", [False, True])
+def test_only_a_search_that_refines_starts_there(refining):
+    draws = Scenarios(Starts(jnp.zeros((2, D)), jnp.ones((2, D))), None, None, None, None)
+    assert np.array_equal(started(draws, jnp.bool_(refining)).start, np.full((2, D), float(refining)))
+
+
 @pytest.mark.slow
-def test_a_search_starts_there_and_what_is_imagined_afterwards_does_not():
+def test_a_refinement_starts_there_and_what_is_imagined_afterwards_does_not():
     task, found = cart(), []
     for share in (0.0, 1.0):
-        config = tiny(search__visited_starts=share, search__steps=3, fit__steps=2)
+        config = tiny(search__visited_starts=share, search__refine_fraction=0.5, search__steps=4, fit__steps=2)
         exp = compose(config, task, dynamics=regression(len(task.state_names), len(task.control_names)))
         state = exp.init(jax.random.key(0))
         state = jax.jit(exp.improve)(exp.add_episode(state, jax.jit(exp.collect)(state)))[0]

@@ -174,7 +174,9 @@ class Search:
     observation_noise: str = setting(
         "model", "whose noise is on what the policy sees: the model's prediction, or the plant's, where it is known"
     )
-    visited_starts: float = setting(0.0, "share of the imagined rollouts that start where the plant has been")
+    visited_starts: float = setting(
+        0.0, "share of the imagined rollouts that start where the plant has been, while a search refines"
+    )
     policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
     period: Period = Period()
@@ -210,6 +212,10 @@ class Search:
             raise ConfigError(f"search.anneal_trials={self.anneal_trials} needs search.refine_fraction=0")
         if self.init == "fresh" and not self.refine_fraction:
             raise ConfigError("search.init=fresh needs search.refine_fraction=0.5; the nearest is better")
+        if self.visited_starts and not self.refine_fraction:
+            raise ConfigError(
+                f"search.visited_starts={self.visited_starts:g} needs search.refine_fraction=0.5; the nearest is 0"
+            )
         if self.num_starts > 1 and not self.reset_optimizer:
             raise ConfigError(
                 f"search.num_starts={self.num_starts} begins every search with fresh policies; it needs"

@@ -139,6 +139,14 @@ def succeeded(costs: Any, task: Task) -> np.ndarray:
     return np.mean(np.asarray(costs)[..., -5:], axis=-1) < task.success
 
 
+def works(trajectory: Trajectory, task: Task) -> Array:
+    """Whether an episode succeeded [], in JAX; the periods that an early end left out cost `task.stop_cost`."""
+    cost = jnp.asarray(trajectory.cost)
+    if trajectory.length is not None:
+        cost = jnp.where(jnp.arange(len(cost)) < trajectory.length, cost, task.stop_cost)
+    return jnp.mean(cost[-5:]) < task.success
+
+
 def verdict(ran: Episode, task: Task) -> dict[str, Any]:
     """What an episode says of its policy: its mean cost a step, and whether it succeeded."""
     return {

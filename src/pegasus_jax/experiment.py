@@ -91,6 +91,7 @@ def experiment(
     search: PolicyOptimizer,
     search_steps: int,
     imagine: Callable[[Key, Params, Params], tuple[Rollout, Array]],
+    expect: Callable[[Key, Params, Params], Array] | None = None,
     explore: Callable[[Key], Array],
     explore_trials: int,
     compare: bool,
@@ -98,9 +99,10 @@ def experiment(
 ) -> Experiment:
     """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned.
 
-    `imagine(key, policy parameters, posterior)` rolls out fresh scenarios -> (rollout, cost [H, K]). With `compare` a
-    new policy takes the old one's place only where it is expected to cost less. With an environment instead of a plant
-    in JAX, `episode` and `collect` are not pure, and `drive` is there.
+    `imagine(key, policy parameters, posterior)` rolls out fresh scenarios -> (rollout, cost [H, K]), and `expect` says
+    what a policy costs a step; None: the mean of that. With `compare` a policy whose newest episode succeeded is
+    followed only by one that is expected to cost less. With an environment instead of a plant in JAX, `episode` and
+    `collect` are not pure, and `drive` is there.
     """
     states, controls = len(task.state_names), len(task.control_names)
 
@@ -114,6 +116,7 @@ def experiment(
             TrainState(controller, search.init(controller)),
             jnp.int32(0),
             jnp.int32(0),
+            jnp.bool_(False),
         )
 
     def act(params: Params, key: Key, x: Array) -> Array:
@@ -177,7 +180,8 @@ def experiment(
         there is no room left.
         """
         check_episode(state, trajectory)
-        return state._replace(data=dataset.add(state.data, trajectory, task.angles), trial=state.trial + 1)
+        data = dataset.add(state.data, trajectory, task.angles)
+        return state._replace(data=data, trial=state.trial + 1, succeeded=episode.works(trajectory, task))
 
     def learn(state: RunState, steps: int = fit_steps) -> tuple[RunState, FitInfo]:
         """Fit the model to the data (Alg. 1 line 5)."""
@@ -212,9 +216,9 @@ def experiment(
         return state._replace(policy=learner), info
 
     def succeed(state: RunState, incumbent: Params) -> tuple[RunState, Successor]:
-        """The policy that goes on after a search: its own, or the incumbent where that is expected to cost no more.
+        """The policy that goes on after a search: its own, or an incumbent that works and is expected to cost no more.
 
-        Both are imagined on the same fresh scenarios under the new model.
+        Both are imagined on the same fresh scenarios under the new model. One that failed teaches nothing new.
         """
         posterior = dynamics.posterior(state.model.params, state.data)
         key = trial_key(state.key, state.trial, IMAGINE)
@@ -224,8 +228,10 @@ def experiment(
                 rolled, cost, jnp.full((), jnp.nan), jnp.bool_(True)
             )
         old_rolled, old_cost = imagine(key, incumbent, posterior)
-        old = jnp.mean(old_cost)
-        replaced = (state.policy_trial == 0) | ~(old <= jnp.mean(cost))
+        old, new = jnp.mean(old_cost), jnp.mean(cost)
+        if expect is not None:
+            old, new = (expect(key, params, posterior) for params in (incumbent, state.policy.params))
+        replaced = (state.policy_trial == 0) | ~state.succeeded | ~(old <= new)
         rolled, cost, params = optax.tree.where(
             replaced, (rolled, cost, state.policy.params), (old_rolled, old_cost, incumbent)
         )

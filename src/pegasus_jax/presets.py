@@ -96,8 +96,10 @@ def swimmer(maneuver: str, legs: int) -> Config:
 
 
 # A cost of one's own has no width to widen; its expectation is a mean over nodes: docs/decisions/0018. A plant of one's
-# own may start anywhere: 0024.
-_OWN_PLANT = Search(cost_width_start=1.0, standardized_noise=True, refine_fraction=0.5, matching="narrow")
+# own may start anywhere: 0024. It is to hold for longer than an episode: 0023.
+_OWN_PLANT = Search(
+    cost_width_start=1.0, standardized_noise=True, refine_fraction=0.5, matching="narrow", visited_starts=0.5
+)
 
 _SWIMMERS = {
     **{f"swimmer_{name}": swimmer(name, 2) for name in MANEUVERS},

@@ -197,3 +197,4 @@ class RunState(NamedTuple):
     policy: TrainState
     trial: Array  # [] int32, episodes added so far
     policy_trial: Array  # [] int32, the trial after which this policy was learned; 0: it has learned nothing yet
+    succeeded: Array  # [] bool, whether the newest episode did

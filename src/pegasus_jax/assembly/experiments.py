@@ -48,7 +48,7 @@ def compose(
     if config.search.visited_starts and searcher is None:
         dynamics = remembering(dynamics)
     policy = policy or policy_of(config.policy, task)
-    configured, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
+    searching = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)
     explore = config.explore
     return experiment(
@@ -57,9 +57,10 @@ def compose(
         policy=policy,
         fit=fitter or fit_of(config.fit, dynamics),
         fit_steps=config.fit.steps,
-        search=searcher or configured,
+        search=searcher or searching.searcher,
         search_steps=config.search.steps,
-        imagine=imagine,
+        imagine=searching.imagine,
+        expect=searching.expect if searcher is None else None,
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
         compare=config.successor == "better",

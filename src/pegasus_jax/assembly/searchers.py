@@ -15,7 +15,7 @@ from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import matching, scenarios
 from pegasus_jax.imagine.objective import either, objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
-from pegasus_jax.imagine.visited import or_visited
+from pegasus_jax.imagine.visited import beside_visited, started
 from pegasus_jax.learn.multistart import best_of
 from pegasus_jax.learn.schedule import SearchTable, search_table
 from pegasus_jax.learn.search import Problem, searcher
@@ -54,14 +54,23 @@ MATCHINGS = {
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]
 
 
+class Searching(NamedTuple):
+    """What a search's settings say."""
+
+    searcher: PolicyOptimizer
+    imagine: Imagine  # fresh rollouts from the task's starts
+    # (key, policy parameters, posterior) -> cost a step [] where the search's rollouts start; None: as `imagine`
+    expect: Callable[[Key, Params, Params], Array] | None = None
+
+
 def search_of(
     search: settings.Search | settings.Analytic,
     task: Task,
     dynamics: Dynamics,
     policy: Policy,
     spread: Spread = together,
-) -> tuple[PolicyOptimizer, Imagine]:
-    """The configured way of improving a policy, and fresh imagined rollouts of the same kind, from the task's starts.
+) -> Searching:
+    """The configured way of improving a policy, and fresh imagined rollouts of the same kind.
 
     With `search.visited_starts` the posterior of `dynamics` is a `Visited`.
     """
@@ -81,7 +90,7 @@ def search_of(
     searched = blocks
     if search.visited_starts:
         around = jnp.asarray(task.start_mean, float)
-        searched = blocks._replace(start=or_visited(blocks.start, search.visited_starts, task.angles, around))
+        searched = blocks._replace(start=beside_visited(blocks.start, search.visited_starts, task.angles, around))
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
     # A particle's cost is 1 / K of the objective.
     limit = None if (most := search.particle_grad_limit) is None else most / search.particles
@@ -93,6 +102,7 @@ def search_of(
 
     def value(params: Params, posterior: Params, given: Scenarios, row: SearchTable) -> Array:
         refining = row.refine if refines else None
+        given = started(given, row.refine) if search.visited_starts else given
         return objective(
             params,
             posterior,
@@ -115,7 +125,11 @@ def search_of(
         found = best_of(found, fresh, num_starts=search.num_starts, window=window, lasting=lasting)
     # A refined policy is good for particles, not for their Gaussian.
     seen_last = matching.keep if refines else match
-    return found, partial(imagined, **pieces, match=seen_last, blocks=blocks, task=task)
+    imagine = partial(imagined, **pieces, match=seen_last, task=task)
+    if not search.visited_starts:
+        return Searching(found, partial(imagine, blocks=blocks))
+    mixed = blocks._replace(start=lambda *given: searched.start(*given).mixed)
+    return Searching(found, partial(imagine, blocks=blocks), lambda *given: jnp.mean(imagine(*given, blocks=mixed)[1]))
 
 
 def table_of(search: settings.Search) -> SearchTable:
@@ -138,7 +152,7 @@ def analytic_search_of(
     dynamics: Dynamics,
     policy: Policy,
     noise: NoiseUse,
-) -> tuple[PolicyOptimizer, Imagine]:
+) -> Searching:
     """PILCO's search. Raises ConfigError where a piece has no moments."""
     if task.stop is not None:
         raise ConfigError("algorithm=pilco propagates a Gaussian, which cannot stop; leave out stop=")
@@ -172,7 +186,7 @@ def analytic_search_of(
     begin = mean, jnp.diag(std**2)
     blocks = blocks_of(search.particles, task, dynamics, policy)
     imagine = partial(imagined, **pieces, blocks=blocks, task=task, match=matching.keep, noise=noise)
-    return pilco.analytic(value, noise_std, restart=search.init == "better"), imagine
+    return Searching(pilco.analytic(value, noise_std, restart=search.init == "better"), imagine)
 
 
 def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Array | None], Callable[[Array], Array]]:

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from pegasus_jax.imagine.scenarios import Block
 from pegasus_jax.math.angles import difference
-from pegasus_jax.types import Array, Dataset, Dynamics, Key, Params, Prediction
+from pegasus_jax.types import Array, Dataset, Dynamics, Key, Params, Prediction, Scenarios
 from pegasus_jax.vectorized import Vectorized, for_particles
 
 STATES = 512  # that a posterior carries: as many for any number of trials, so that a search compiles once
@@ -47,17 +47,30 @@ def remembering(dynamics: Dynamics) -> Dynamics:
     )
 
 
-def or_visited(start: Block, share: float, angles: tuple[int, ...], around: Array) -> Block:
-    """First states [K, D] as `start` draws them, each with probability `share` a state of a `Visited` in its place.
+class Starts(NamedTuple):
+    """Two first states of each particle: the scenarios of a search have one of them, by what it does."""
 
-    Its `angles` are those less than half a turn from `around` [D], whatever turns the plant has made.
+    own: Array  # [K, D] as the task's episodes begin
+    mixed: Array  # [K, D] the same, of some particles one that the plant has visited
+
+
+def beside_visited(start: Block, share: float, angles: tuple[int, ...], around: Array) -> Block:
+    """`Starts` as `start` draws them, mixed with probability `share` with states of a `Visited`.
+
+    Their `angles` are those less than half a turn from `around` [D], whatever turns the plant has made.
     """
 
-    def block(key: Key, given: Visited) -> Array:
+    def block(key: Key, given: Visited) -> Starts:
         own = start(key, given)
         chosen, row = jax.random.split(jax.random.fold_in(key, _VISITED))
         states = given.states[jax.random.randint(row, own.shape[:1], 0, STATES)]
         near = (around + difference(states, around, angles)).astype(own.dtype)
-        return jnp.where(jax.random.bernoulli(chosen, share, (len(own), 1)), near, own)
+        return Starts(own, jnp.where(jax.random.bernoulli(chosen, share, (len(own), 1)), near, own))
 
     return block
+
+
+def started(given: Scenarios, refining: Array) -> Scenarios:
+    """The scenarios of `Starts` that hold for a visit: a search that refines also begins where the plant has been."""
+    own, mixed = given.start
+    return given._replace(start=jnp.where(refining, mixed, own))
