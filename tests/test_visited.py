@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from pegasus_jax.assembly.experiments import compose
-from pegasus_jax.imagine.visited import STATES, Starts, Visited, beside_visited, remembering, started
+from pegasus_jax.imagine.visited import STATES, Starts, Visited, beside_visited, remember, remembering, started
 from pegasus_jax.models.ensemble import ensemble
-from pegasus_jax.types import Dataset, Scenarios
+from pegasus_jax.types import Dataset, RunState, Scenarios, TrainState
 from pegasus_jax.vectorized import for_particles
 from probes import cart, experience, network, regression, same, tiny
 
@@ -23,16 +23,21 @@ def rows(size, capacity=700):
     return Dataset(x, x[:, :1], x, jnp.int32(size))
 
 
-def drawn(share, states, angles=(), around=0.0):
+def run_state(data, succeeded=True):
+    nothing = TrainState(None, None)
+    return RunState(jax.random.key(0), data, nothing, nothing, jnp.int32(1), jnp.int32(1), jnp.bool_(succeeded))
+
+
+def drawn(share, states, angles=(), around=0.0, succeeded=True):
     start = beside_visited(lambda key, given: jnp.full((K, D), -5.0), share, angles, jnp.full(D, around))
-    found = start(jax.random.key(0), Visited(None, states))
+    found = start(jax.random.key(0), Visited(None, states, jnp.bool_(succeeded)))
     assert np.array_equal(found.own, np.full((K, D), -5.0))
     return np.asarray(found.mixed)
 
 
 @pytest.mark.parametrize("size", [1, 7, STATES, 600])
 def test_the_states_are_the_rows_in_use_evenly(size):
-    kept = np.asarray(remembering(network()._replace(posterior=lambda *_: None)).posterior(None, rows(size)).states)
+    kept = np.asarray(remember(None, run_state(rows(size))).states)
     assert kept.shape == (STATES, D)
     places, counts = np.unique(kept[:, 0], return_counts=True)
     assert len(places) == min(size, STATES)
@@ -54,6 +59,11 @@ def test_so_large_a_share_starts_there(share):
         assert len(np.unique(x[:, 0])) > 0.9 * (1 - np.exp(-K / STATES)) * STATES
 
 
+def test_before_a_success_nothing_starts_there():
+    assert np.array_equal(drawn(1.0, jnp.zeros((STATES, D)), succeeded=False), np.full((K, D), -5.0))
+    assert not bool(remember(None, run_state(rows(3), succeeded=False)).succeeded)
+
+
 def test_angles_are_those_near_the_starts_whatever_turns_the_plant_made():
     turns = jnp.full((STATES, D), 0.5 + 6 * np.pi, jnp.float32)
     x = drawn(1.0, turns, angles=(1,), around=np.pi)
@@ -67,15 +77,16 @@ def test_a_model_that_remembers_predicts_as_before(members):
     model = network() if members == 1 else ensemble(network(), members)
     data = experience()
 
-    @partial(jax.jit, static_argnums=0)
-    def predicted(one):
+    @partial(jax.jit, static_argnums=(0, 1))
+    def predicted(one, remembered):
         posterior = one.posterior(model.init(jax.random.key(1)), data)
+        posterior = remember(posterior, run_state(data)) if remembered else posterior
         keys = jax.random.split(jax.random.key(2), 6)
         draws = jax.vmap(one.sample, (0, None))(keys, posterior) if one.deal is None else one.deal(keys, posterior)
         alone = one.apply(posterior, jax.tree.map(lambda leaf: leaf[0], draws), data.x[0], data.u[0])
         return for_particles(one.apply)(posterior, draws, data.x[:6], data.u[:6]), alone
 
-    assert same(predicted(model), predicted(remembering(model)))
+    assert same(predicted(model, False), predicted(remembering(model), True))
 
 
 @pytest.mark.parametrize("refining", [False, True])
@@ -91,7 +102,8 @@ def test_a_refinement_starts_there_and_what_is_imagined_afterwards_does_not():
         config = tiny(search__visited_starts=share, search__refine_fraction=0.5, search__steps=4, fit__steps=2)
         exp = compose(config, task, dynamics=regression(len(task.state_names), len(task.control_names)))
         state = exp.init(jax.random.key(0))
-        state = jax.jit(exp.improve)(exp.add_episode(state, jax.jit(exp.collect)(state)))[0]
+        state = exp.add_episode(state, jax.jit(exp.collect)(state))
+        state = jax.jit(exp.improve)(state._replace(succeeded=jnp.bool_(True)))[0]
         found.append((state.policy.params, jax.jit(exp.imagine)(state)[0].x[0]))
     (own, own_starts), (other, starts) = found
     assert not same(own, other)

@@ -51,3 +51,13 @@ def reacher(x: Array) -> Array:
 def cartpole(x: Array) -> Array:
     """[x, x', angle', angle] of the project's own cart-pole, 0 hanging: the tip over the middle of the rail."""
     return saturating((x[0] + 0.6 * jnp.sin(x[3])) / 0.25, 0.6 * (jnp.cos(x[3]) + 1) / 0.25)
+
+
+def dm_cartpole(x: Array) -> Array:
+    """[cart, angle, speed, rate], upright at 0: the tip of a pole of 1 m over the middle of the rail."""
+    return saturating((x[0] + jnp.sin(x[1])) / 0.4, (jnp.cos(x[1]) - 1) / 0.4)
+
+
+def dm_pendulum(x: Array) -> Array:
+    """[angle, rate], upright at 0."""
+    return saturating((jnp.cos(x[0]) - 1) / 0.5, jnp.sin(x[0]) / 0.5)

@@ -92,6 +92,7 @@ def experiment(
     search_steps: int,
     imagine: Callable[[Key, Params, Params], tuple[Rollout, Array]],
     expect: Callable[[Key, Params, Params], Array] | None = None,
+    remember: Callable[[Any, RunState], Any] | None = None,
     explore: Callable[[Key], Array],
     explore_trials: int,
     compare: bool,
@@ -101,8 +102,9 @@ def experiment(
 
     `imagine(key, policy parameters, posterior)` rolls out fresh scenarios -> (rollout, cost [H, K]), and `expect` says
     what a policy costs a step; None: the mean of that. With `compare` a policy whose newest episode succeeded is
-    followed only by one that is expected to cost less. With an environment instead of a plant in JAX, `episode` and
-    `collect` are not pure, and `drive` is there.
+    followed only by one that is expected to cost less. `remember(posterior, state)` is what all of them are given in a
+    posterior's place. With an environment instead of a plant in JAX, `episode` and `collect` are not pure, and `drive`
+    is there.
     """
     states, controls = len(task.state_names), len(task.control_names)
 
@@ -188,6 +190,10 @@ def experiment(
         learner, info = fit.run(trial_key(state.key, state.trial, FIT), state.model, state.data, steps)
         return state._replace(model=learner), info
 
+    def posterior_of(state: RunState) -> Any:
+        posterior = dynamics.posterior(state.model.params, state.data)
+        return posterior if remember is None else remember(posterior, state)
+
     def adapted(params: Params, data: Dataset) -> Params:
         return params if policy.adapt is None else policy.adapt(params, data)
 
@@ -196,7 +202,7 @@ def experiment(
     ) -> tuple[RunState, SearchInfo]:
         """Improve the policy in imagination (Alg. 1 line 6), from iteration `first` of the trial's search."""
         key = trial_key(state.key, state.trial, SEARCH)
-        posterior = dynamics.posterior(state.model.params, state.data)
+        posterior = posterior_of(state)
 
         explored = max(1, explore_trials)
         # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
@@ -220,7 +226,7 @@ def experiment(
 
         Both are imagined on the same fresh scenarios under the new model. One that failed teaches nothing new.
         """
-        posterior = dynamics.posterior(state.model.params, state.data)
+        posterior = posterior_of(state)
         key = trial_key(state.key, state.trial, IMAGINE)
         rolled, cost = imagine(key, state.policy.params, posterior)
         if not compare:
@@ -257,7 +263,7 @@ def experiment(
 
     def simulate(state: RunState) -> tuple[Rollout, Array]:
         """Rollouts of the policy under scenarios the search has not seen, and their costs [H, K]."""
-        posterior = dynamics.posterior(state.model.params, state.data)
+        posterior = posterior_of(state)
         return imagine(trial_key(state.key, state.trial, IMAGINE), state.policy.params, posterior)
 
     def calibrate(state: RunState, trajectory: Trajectory) -> Array:
@@ -265,7 +271,7 @@ def experiment(
 
         With a key of its own, so that asking changes nothing.
         """
-        posterior = dynamics.posterior(state.model.params, state.data)
+        posterior = posterior_of(state)
         key = trial_key(state.key, state.trial + 1, CALIBRATE)
         found = calibration(key, posterior, trajectory, dynamics=dynamics, angles=task.angles)
         return jnp.where(state.trial >= max(1, explore_trials), found, jnp.nan)

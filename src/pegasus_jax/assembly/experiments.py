@@ -12,7 +12,7 @@ from pegasus_jax.assembly.pieces import dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import limits, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
-from pegasus_jax.imagine.visited import remembering
+from pegasus_jax.imagine.visited import remember, remembering
 from pegasus_jax.sharding import over_particles
 from pegasus_jax.types import Array, Cost, Dynamics, ModelLearner, Policy, PolicyOptimizer, Task
 
@@ -45,8 +45,8 @@ def compose(
     """
     task = task._replace(cost=as_cost(task.cost if cost is None else cost))
     dynamics = dynamics or dynamics_of(config.model, task)
-    if config.search.visited_starts and searcher is None:
-        dynamics = remembering(dynamics)
+    visits = bool(config.search.visited_starts) and searcher is None
+    dynamics = remembering(dynamics) if visits else dynamics
     policy = policy or policy_of(config.policy, task)
     searching = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)
@@ -60,7 +60,8 @@ def compose(
         search=searcher or searching.searcher,
         search_steps=config.search.steps,
         imagine=searching.imagine,
-        expect=searching.expect if searcher is None else None,
+        expect=searching.expect if visits else None,
+        remember=remember if visits else None,
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
         compare=config.successor == "better",

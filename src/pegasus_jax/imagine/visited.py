@@ -2,6 +2,7 @@
 
 From the task's own starts alone a search sees the first H periods of an episode and no more: a cart that creeps away
 costs next to nothing in them, and falls off the rail's end later. From a state late in an episode it sees H periods on.
+A policy that has not succeeded yet has nothing to hold, and would learn its task later for it.
 """
 
 from typing import Any, NamedTuple
@@ -11,7 +12,7 @@ import jax.numpy as jnp
 
 from pegasus_jax.imagine.scenarios import Block
 from pegasus_jax.math.angles import difference
-from pegasus_jax.types import Array, Dataset, Dynamics, Key, Params, Prediction, Scenarios
+from pegasus_jax.types import Array, Dynamics, Key, Params, Prediction, RunState, Scenarios
 from pegasus_jax.vectorized import Vectorized, for_particles
 
 STATES = 512  # that a posterior carries: as many for any number of trials, so that a search compiles once
@@ -23,14 +24,17 @@ class Visited(NamedTuple):
 
     posterior: Any
     states: Array  # [512, D]
+    succeeded: Array  # [] bool, whether the newest episode did
+
+
+def remember(posterior: Any, state: RunState) -> Visited:
+    """The posterior with rows evenly spaced in a run's data, repeated where it has few."""
+    rows = jnp.arange(STATES) * state.data.size // STATES
+    return Visited(posterior, state.data.x[rows], state.succeeded)
 
 
 def remembering(dynamics: Dynamics) -> Dynamics:
-    """The same model, whose posterior is a `Visited`: rows evenly spaced in the data, repeated where it has few."""
-
-    def posterior(params: Params, data: Dataset) -> Visited:
-        rows = jnp.arange(STATES) * data.size // STATES
-        return Visited(dynamics.posterior(params, data), data.x[rows])
+    """The same model, whose draws and predictions are those of a `Visited`."""
 
     def one(given: Visited, draw: Params, x: Array, u: Array) -> Prediction:
         return dynamics.apply(given.posterior, draw, x, u)
@@ -40,7 +44,6 @@ def remembering(dynamics: Dynamics) -> Dynamics:
 
     deal = dynamics.deal
     return dynamics._replace(
-        posterior=posterior,
         sample=lambda key, given: dynamics.sample(key, given.posterior),
         apply=Vectorized(one, many),
         deal=None if deal is None else lambda keys, given: deal(keys, given.posterior),
@@ -55,7 +58,7 @@ class Starts(NamedTuple):
 
 
 def beside_visited(start: Block, share: float, angles: tuple[int, ...], around: Array) -> Block:
-    """`Starts` as `start` draws them, mixed with probability `share` with states of a `Visited`.
+    """`Starts` as `start` draws them, mixed with probability `share` with states of a `Visited` that has succeeded.
 
     Their `angles` are those less than half a turn from `around` [D], whatever turns the plant has made.
     """
@@ -65,7 +68,8 @@ def beside_visited(start: Block, share: float, angles: tuple[int, ...], around: 
         chosen, row = jax.random.split(jax.random.fold_in(key, _VISITED))
         states = given.states[jax.random.randint(row, own.shape[:1], 0, STATES)]
         near = (around + difference(states, around, angles)).astype(own.dtype)
-        return Starts(own, jnp.where(jax.random.bernoulli(chosen, share, (len(own), 1)), near, own))
+        elsewhere = jax.random.bernoulli(chosen, share, (len(own), 1)) & given.succeeded
+        return Starts(own, jnp.where(elsewhere, near, own))
 
     return block
 
