@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import interrupt, tasks
 from pegasus_jax.checks import ConfigError, RunError, check_range
-from pegasus_jax.episode import Episode, drive
+from pegasus_jax.episode import Episode, drive, states
 from pegasus_jax.exports.watchdog import Watchdog
 from pegasus_jax.exports.write import export
 from pegasus_jax.math.circles import to_observation
@@ -94,7 +93,7 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
     rows: list[Any] = []
 
     def save(ran: Episode) -> Drive:
-        seen = jnp.asarray(ran.trajectory.x)[1:]
+        seen = states(task, ran.trajectory)[1:] if len(ran.trajectory.u) else []
         cost = np.asarray(jax.vmap(task.cost.of_state)(seen) if len(seen) else [], np.float32)
         kept = ran._replace(trajectory=ran.trajectory._replace(cost=cost))  # type: ignore[arg-type]
         done = Drive(log, kept, task.dt, np.array(times[: len(ran.trajectory.u)]) - (times[0] if times else 0))

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 
 from pegasus_jax.imagine.scenarios import Block
 from pegasus_jax.math.angles import difference
+from pegasus_jax.memory import join, split
 from pegasus_jax.types import Array, Dataset, Dynamics, Key, Params, Prediction
 from pegasus_jax.vectorized import Vectorized, for_particles
 
@@ -22,7 +23,7 @@ class Visited(NamedTuple):
     """A posterior, and states of the data that it was learned from."""
 
     posterior: Any
-    states: Array  # [512, D]
+    states: Array  # [512, D + M]
 
 
 def remembering(dynamics: Dynamics) -> Dynamics:
@@ -30,7 +31,7 @@ def remembering(dynamics: Dynamics) -> Dynamics:
 
     def posterior(params: Params, data: Dataset) -> Visited:
         rows = jnp.arange(STATES) * data.size // STATES
-        return Visited(dynamics.posterior(params, data), data.x[rows])
+        return Visited(dynamics.posterior(params, data), join(data.x, data.memory)[rows])
 
     def one(given: Visited, draw: Params, x: Array, u: Array) -> Prediction:
         return dynamics.apply(given.posterior, draw, x, u)
@@ -48,7 +49,7 @@ def remembering(dynamics: Dynamics) -> Dynamics:
 
 
 def or_visited(start: Block, share: float, angles: tuple[int, ...], around: Array) -> Block:
-    """First states [K, D] as `start` draws them, each with probability `share` a state of a `Visited` in its place.
+    """First states [K, D + M] as `start` draws them, each with probability `share` one of a `Visited` in its place.
 
     Its `angles` are those less than half a turn from `around` [D], whatever turns the plant has made.
     """
@@ -57,7 +58,8 @@ def or_visited(start: Block, share: float, angles: tuple[int, ...], around: Arra
         own = start(key, given)
         chosen, row = jax.random.split(jax.random.fold_in(key, _VISITED))
         states = given.states[jax.random.randint(row, own.shape[:1], 0, STATES)]
-        near = (around + difference(states, around, angles)).astype(own.dtype)
+        x, m = split(states, around.shape[0])
+        near = join((around + difference(x, around, angles)).astype(own.dtype), m)
         return jnp.where(jax.random.bernoulli(chosen, share, (len(own), 1)), near, own)
 
     return block

@@ -114,7 +114,8 @@ def input_scale(task: Task, units: tuple[float, ...]) -> Any:
     names = [name for i, name in enumerate(task.state_names) if i not in task.angles]
     if units and len(units) != len(names):
         raise ConfigError(f"policy.input_units={list(units)} must be {len(names)} numbers, of {', '.join(names)}")
-    return np.concatenate([1 / np.array(units), np.ones(2 * len(task.angles))]) if units else 1.0
+    others = len(task.memory.shown) + len(task.memory.shown_angles) + 2 * len(task.angles)
+    return np.concatenate([1 / np.array(units), np.ones(others)]) if units else 1.0
 
 
 def resolve(config: Config) -> Config:
