@@ -106,13 +106,14 @@ def experiment(
     """
     states, controls, memory = len(task.state_names), len(task.control_names), task.memory
     see, given, advance = recall.steps(memory)
+    inputs, more = recall.given_size(memory, controls), 0 if task.hindsight is None else task.hindsight.more
 
     def init(key: Key) -> RunState:
         model_key, policy_key = jax.random.split(jax.random.fold_in(key, 0))
         model, controller = dynamics.init(model_key), policy.init(policy_key)
         return RunState(
             key,
-            dataset.empty(capacity, states, recall.given_size(memory, controls), len(memory.names)),
+            dataset.empty(capacity, states, inputs + more, len(memory.names)),
             TrainState(model, fit.init(model)),
             TrainState(controller, search.init(controller)),
             jnp.int32(0),
@@ -196,9 +197,14 @@ def experiment(
         return state._replace(data=dataset.add(state.data, ran, task.angles, m), trial=state.trial + 1)
 
     def as_modeled(trajectory: Trajectory) -> tuple[Trajectory, Array | None]:
-        """An episode with the controls that the model is given [H, V], and what was remembered along it [H+1, M]."""
+        """An episode as the model learns it, with its states and controls [H, V], and what was remembered [H+1, M]."""
         m = recall.replay(memory, trajectory)
-        return trajectory if m is None else trajectory._replace(u=jax.vmap(given)(m[:-1], trajectory.u)), m
+        u = trajectory.u if m is None else jax.vmap(given)(m[:-1], trajectory.u)
+        if task.hindsight is None:
+            return trajectory._replace(u=u), m
+        length = len(u) if trajectory.length is None else trajectory.length
+        x, more = task.hindsight.states(trajectory.x, length, u)
+        return trajectory._replace(x=x, u=jnp.concatenate([u, more], 1)), m
 
     def learn(state: RunState, steps: int = fit_steps) -> tuple[RunState, FitInfo]:
         """Fit the model to the data (Alg. 1 line 5)."""
@@ -285,7 +291,7 @@ def experiment(
         posterior = dynamics.posterior(state.model.params, state.data)
         key = trial_key(state.key, state.trial + 1, CALIBRATE)
         ran, _ = as_modeled(trajectory)
-        found = calibration(key, posterior, ran, dynamics=dynamics, angles=task.angles)
+        found = calibration(key, posterior, ran._replace(u=ran.u[:, :inputs]), dynamics=dynamics, angles=task.angles)
         return jnp.where(state.trial >= max(1, explore_trials), found, jnp.nan)
 
     return Experiment(

@@ -38,6 +38,11 @@ def past_controls(names: tuple[str, ...], rest: Any, count: int, *, shown: bool)
     )
 
 
+def resting(task: Task) -> np.ndarray:
+    """What an episode's controls [U] are taken to have been before it: 0, or the nearest that is allowed."""
+    return np.clip(np.zeros(len(task.control_names)), task.control_low, task.control_high)
+
+
 def clock(dt: float) -> Memory:
     """The time since an episode's start [s], which the policy does not see."""
     return Memory(("t [s]",), lambda key, o: jnp.zeros(1, o.dtype), lambda m, o, u: m + dt, matched=False)
@@ -57,6 +62,7 @@ def combined(*memories: Memory) -> Memory:
     memories = tuple(memory for memory in memories if memory.names)
     if len(memories) < 2:
         return memories[0] if memories else NO_MEMORY
+    measuring = [memory.measured for memory in memories if memory.measured is not None]
     applying = [i for i, memory in enumerate(memories) if memory.applied is not None]
     if len(applying) > 1:
         raise ValueError(f"{len(applying)} memories say what the model's control is; expected one at most")
@@ -82,6 +88,7 @@ def combined(*memories: Memory) -> Memory:
         shown_angles=tuple(int(shown[i]) + a for i, memory in enumerate(memories) for a in memory.shown_angles),
         applied=applied if applying else None,
         matched=all(memory.matched for memory in memories),
+        measured=measuring[0] if measuring else None,
     )
 
 
@@ -107,8 +114,11 @@ def steps(memory: Memory) -> tuple[Callable[..., Array], Callable[..., Array], C
     advance: (m, o, u) -> m one period later.
     """
 
+    measured = None if memory.measured is None else np.array(memory.measured)
+
     def see(m: Any, o: Array) -> Array:
-        return jnp.concatenate([o, memory.show(m, o)]) if memory.shown else o
+        seen = o if measured is None else o[measured]
+        return jnp.concatenate([seen, memory.show(m, o)]) if memory.shown else seen
 
     def given(m: Any, u: Array) -> Array:
         return u if memory.applied is None else memory.applied(m, u)
@@ -122,14 +132,20 @@ def given_size(memory: Memory, controls: int) -> int:
     return jax.eval_shape(steps(memory)[1], m, jnp.zeros(controls)).shape[0]
 
 
+def measured(task: Task) -> tuple[int, ...]:
+    """The entries of the state that an observation tells; of the others it has something that nobody looks at."""
+    return tuple(range(len(task.state_names))) if task.memory.measured is None else task.memory.measured
+
+
 def seen_names(task: Task) -> tuple[str, ...]:
     """Names of what the policy sees [P]."""
-    return (*task.state_names, *task.memory.shown)
+    return (*(task.state_names[i] for i in measured(task)), *task.memory.shown)
 
 
 def seen_angles(task: Task) -> tuple[int, ...]:
     """Which entries of what the policy sees are angles."""
-    return (*task.angles, *(len(task.state_names) + i for i in task.memory.shown_angles))
+    seen = measured(task)
+    return (*(seen.index(i) for i in task.angles if i in seen), *(len(seen) + i for i in task.memory.shown_angles))
 
 
 def replay(memory: Memory, trajectory: Trajectory) -> Array | None:

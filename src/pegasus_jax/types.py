@@ -19,7 +19,7 @@ class Dataset(NamedTuple):
     """Transitions (x_t, u_t) -> x_{t+1} - x_t in arrays of fixed capacity, so that nothing recompiles as data grows."""
 
     x: Array  # [N, D] observed state
-    u: Array  # [N, V] control as the model is given it; V = U unless the task's memory says otherwise
+    u: Array  # [N, V] control as the model is given it; V = U unless the task's memory or hindsight says otherwise
     y: Array  # [N, D] change of state; differences of angles are wrapped to (-pi, pi]
     size: Array  # [] int32, rows in use; the rows beyond are zero
     memory: Array | None = None  # [N, M] what was remembered there; None: the task has no memory
@@ -124,6 +124,16 @@ class Memory(NamedTuple):
     applied: Callable[[Any, Array], Array] | None = None
     # Whether m may be redrawn with x from their common Gaussian. Not what an episode keeps, and x depends on: a goal.
     matched: bool = True
+    measured: tuple[int, ...] | None = None  # the entries of o that are looked at; None: all
+
+
+class Hindsight(NamedTuple):
+    """How the states of an episode are known afterwards, better than while it ran: what a model learns."""
+
+    # (observations [H+1, D], the last row that took place, controls as the model is given them [H, V]) -> (states
+    # [H+1, D], more controls [H, W]: what the fit is told beside them, and a rollout is not)
+    states: Callable[[Array, Array, Array], tuple[Array, Array]]
+    more: int  # W
 
 
 NO_MEMORY = Memory((), lambda key, o: None, lambda m, o, u: m)
@@ -183,6 +193,7 @@ class Task(NamedTuple):
     circles: tuple[tuple[int, ...], ...] = ()
     starts: Any = None  # [N, D] states where episodes start, equally likely; None: N(start_mean, diag(start_std^2))
     memory: Memory = NO_MEMORY
+    hindsight: Hindsight | None = None  # None: the states are as observed
 
     @property
     def may_end(self) -> bool:

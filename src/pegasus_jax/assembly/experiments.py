@@ -12,9 +12,10 @@ from pegasus_jax.assembly.pieces import dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import limits, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
+from pegasus_jax.imagine import visited
 from pegasus_jax.imagine.costs import blind_to_memory
-from pegasus_jax.imagine.visited import remembering
 from pegasus_jax.sharding import over_particles
+from pegasus_jax.tasks.remembered import remembering
 from pegasus_jax.types import Array, Cost, Dynamics, ModelLearner, Policy, PolicyOptimizer, Task
 
 EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
@@ -45,11 +46,12 @@ def compose(
     does not suit the config: a cost without a width, for example, needs `search.cost_width_start=1`.
     """
     task = task._replace(cost=as_cost(task.cost if cost is None else cost))
+    task = remembering(config, task)
     if task.memory.names:
         task = blind(task)
     dynamics = dynamics or dynamics_of(config.model, task)
     if config.search.visited_starts and searcher is None:
-        dynamics = remembering(dynamics)
+        dynamics = visited.remembering(dynamics)
     policy = (policy or policy_of(config.policy, task))._replace(memory=task.memory)
     configured, imagine = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)

@@ -17,6 +17,7 @@ from pegasus_jax.models import dropout
 from pegasus_jax.models.bnn import bnn
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.models.lagrangian import lagrangian
+from pegasus_jax.models.sharpened import sharpened
 from pegasus_jax.pilco.gp import gp
 from pegasus_jax.pilco.lbfgs import full_data
 from pegasus_jax.pilco.rbf import rbf
@@ -48,6 +49,8 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
     """The configured model of a task's dynamics. Raises ConfigError where the task does not suit it."""
     controls = given_size(task.memory, len(task.control_names))
     shape: dict[str, Any] = dict(states=len(task.state_names), controls=controls, angles=task.angles)
+    if task.hindsight is not None and isinstance(config, settings.GP | settings.SSGP):
+        raise ConfigError("sensors.velocity= needs a model=lagrangian or another network; the nearest is history=2")
     match config:
         case settings.GP():
             return gp(**shape)
@@ -58,7 +61,10 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
             member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
         case settings.BNN():
             member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic)
-    return ensemble(member, config.ensemble_size) if config.ensemble_size > 1 else member
+    model = ensemble(member, config.ensemble_size) if config.ensemble_size > 1 else member
+    if task.hindsight is None:
+        return model
+    return sharpened(model, rates=task.rates, controls=len(task.control_names), inputs=controls)
 
 
 def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
