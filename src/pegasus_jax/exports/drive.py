@@ -16,10 +16,10 @@ from pegasus_jax.checks import ConfigError, RunError, check_range
 from pegasus_jax.episode import Episode, drive, states
 from pegasus_jax.exports.watchdog import Watchdog
 from pegasus_jax.exports.write import export
-from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs import restore, store
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.runs.files import write_whole
+from pegasus_jax.tasks import sensed
 from pegasus_jax.types import Task, Trajectory
 
 SLACK = 0.1  # of a period, by which a control may follow the one before it too late
@@ -110,7 +110,7 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
 
     with Watchdog(limit, task.environment.close, last_words) as watch:
         on_time = task._replace(environment=timed(task.environment, task.dt, times, rows, watch.beat))
-        ran = drive(seed, lambda t, x: control(to_observation(x, task.circles)), on_time)
+        ran = drive(seed, lambda t, x: control(sensed.observation(x, task)), on_time)
     done = save(ran)
     if watch.fired:
         raise RunError(_stopped(task, limit, len(done.times), log))

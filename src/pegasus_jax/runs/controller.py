@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pegasus_jax import memory as recall
-from pegasus_jax.math.circles import to_state
 from pegasus_jax.runs import restore
+from pegasus_jax.tasks import sensed
 from pegasus_jax.types import Array, Params
 
 
@@ -25,17 +25,17 @@ class Controller:
     def __init__(self, run: Path, trial: restore.Trial) -> None:
         config, experiment, state = restore.restored(run, trial)
         self.trial = int(state.trial)
-        circles, memory = experiment.task.circles, experiment.task.memory
+        task, memory = experiment.task, experiment.task.memory
         see, _, advance = recall.steps(memory)
-        self._params, self._size = state.policy.params, len(experiment.task.state_names) + len(circles)
+        self._params, self._size = state.policy.params, len(recall.measured(task)) + len(task.circles)
         double = config.x64
         self._type, self._width = (np.float64, partial(jax.enable_x64, True)) if double else (np.float32, nullcontext)
 
         def start(x: Array) -> Array | None:
-            return recall.begin(memory, jax.random.key(0), to_state(x, circles))
+            return recall.begin(memory, jax.random.key(0), sensed.state(x, task))
 
         def act(params: Params, m: Array | None, x: Array) -> tuple[Array, Array | None]:
-            o = to_state(x, circles)
+            o = sensed.state(x, task)
             u = experiment.policy.apply(params, None, see(m, o))
             return u, advance(m, o, u)
 

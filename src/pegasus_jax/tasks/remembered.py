@@ -1,6 +1,7 @@
 """What a controller remembers of sensors that are late, or measure no rates, and what is known afterwards."""
 
 from functools import partial
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,35 +16,42 @@ WINDOW, ORDER = 5, 3  # rows of the local polynomial that tells rates afterwards
 
 def remembering(config: Config, task: Task) -> Task:
     """The task with what its controller remembers, and its states as they are known afterwards, by the settings."""
-    sensors, rows = config.sensors, config.history
-    memories = [task.memory]
-    computed = sensors.velocity != "none"
-    if rows > 1 or sensors.delay or computed:
-        # A difference is the rate half a period ago: what has acted since then, the last control tells.
-        memories.append(history(task, rows=rows, delay=sensors.delay, more=int(computed)))
-    if computed:
-        memories.append(velocities(task, weight_of(config, task)))
+    kept, memories = kept_by(config, task), [task.memory]
+    if kept.controls:
+        memories.append(history(task, rows=1 + kept.rows, delay=config.sensors.delay, controls=kept.controls))
+    if kept.rates:
+        memories.append(velocities(task, kept.weight))
         task = task._replace(hindsight=Hindsight(partial(smoothed, task=task), 2 * len(task.control_names)))
     return task._replace(memory=combined(*memories))
 
 
-def weight_of(config: Config, task: Task) -> float:
-    """What a low-pass of first order takes in of each difference."""
-    if config.sensors.velocity == "difference":
-        return 1.0
-    cutoff = config.sensors.cutoff or 0.2 / task.dt
-    return float(1 - np.exp(-2 * np.pi * cutoff * task.dt))
+class Kept(NamedTuple):
+    """What a controller keeps of an episode."""
+
+    controls: int  # the last ones
+    rows: int  # the last observations before the newest
+    rates: bool  # are computed
+    weight: float  # of the newest difference in them
 
 
-def history(task: Task, *, rows: int = 1, delay: int = 0, more: int = 0) -> Memory:
+def kept_by(config: Config, task: Task) -> Kept:
+    """What the controller keeps by the settings: every control whose effect the observations do not tell yet."""
+    sensors, rows = config.sensors, config.history - 1
+    rates, weight = sensors.velocity != "none", 1.0
+    if sensors.velocity == "filter":  # a low-pass of first order
+        weight = float(1 - np.exp(-2 * np.pi * (sensors.cutoff or 0.2 / task.dt) * task.dt))
+    # A difference is the rate half a period ago: what has acted since then, one more control tells.
+    return Kept(sensors.delay + rows + rates, rows, rates, weight)
+
+
+def history(task: Task, *, rows: int, delay: int, controls: int) -> Memory:
     """The last `rows` observations and controls, of which the newest acts `delay` periods after it was given.
 
-    The policy sees the observations before the newest, and every control that is not known to them yet: the last
-    delay + rows - 1, and `more`. The model is given the control that acts now, those of the rows before, and these
-    rows' observations, angles as sines and cosines.
+    The policy sees the observations before the newest, and the last `controls`. The model is given the control that
+    acts now, those of the rows before, and these rows' observations, angles as sines and cosines.
     """
     size, states, past_rows = len(task.control_names), len(task.state_names), rows - 1
-    shown = past_controls(task.control_names, resting(task), delay + past_rows + more, shown=True)
+    shown = past_controls(task.control_names, resting(task), controls, shown=True)
     kept = len(shown.names)
     times = range(1, rows)
     names = tuple(f"{name} {i} before" for i in times for name in task.state_names)

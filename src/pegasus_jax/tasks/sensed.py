@@ -7,9 +7,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pegasus_jax import memory
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Sensors
-from pegasus_jax.math.circles import Circles, to_state
+from pegasus_jax.math.circles import Circles, to_observation, to_state
 from pegasus_jax.memory import resting
 from pegasus_jax.types import Cost, Task
 
@@ -154,6 +155,19 @@ def chosen(task: Task, measured: Sequence[int], circles: Circles) -> tuple[Task,
         **_picked(task, keep),
     )
     return task, tuple((keep.index(i), keep.index(j)) for i, j in circles if {i, j} <= {*keep})
+
+
+def state(x: Any, task: Task) -> Any:
+    """The state [..., D] of an observation [..., O] as a controller is given it; what that does not tell is 0."""
+    x, places = to_state(x, task.circles), memory.measured(task)
+    size = len(task.state_names)
+    return x if len(places) == size else jnp.zeros((*x.shape[:-1], size), x.dtype).at[..., np.array(places)].set(x)
+
+
+def observation(x: Any, task: Task) -> Any:
+    """What a controller is given [..., O] where the state is x [..., D]."""
+    places = memory.measured(task)
+    return to_observation(x if len(places) == len(task.state_names) else x[..., np.array(places)], task.circles)
 
 
 def state_of(rows: np.ndarray, task: Task, sensors: Sensors) -> np.ndarray:
