@@ -292,6 +292,15 @@ def _() -> Any:
     return [kind.mask(kind.init(key(), 3), kind.sample(key(), 3)) for kind in kinds]
 
 
+@example(*(f"memory.{name}" for name in pg.memory.__all__))
+def _() -> Any:
+    past = pg.memory.past_controls(("u",), [0.0], 2, shown=True)
+    goal = pg.memory.constant(("goal",), lambda key: jax.random.normal(key, (1,)))
+    remembered = pg.memory.combined(past, pg.memory.clock(0.3), goal)
+    assert isinstance(remembered, pg.Memory)
+    return pg.compose(CONFIG, TASK._replace(memory=remembered)).init(key()).data
+
+
 @example(*(f"data.{name}" for name in pg.data.__all__))
 def _() -> Any:
     rows = pg.data.minibatch(key(), pg.data.grow(experience(), 3 * H), 6)

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 # Folders end in a dot. What one layer holds side by side does not import each other.
 LAYERS = {
     0: "types checks interrupt",
-    1: "config_models shapes sharding vectorized math.",
+    1: "config_models shapes memory sharding vectorized math.",
     2: "config models. imagine. episode",
     3: "presets policies. learn.",
     4: "tasks. pilco. experiment",

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pegasus_jax import config as config
+    from pegasus_jax import memory as memory
     from pegasus_jax import tasks as tasks
     from pegasus_jax.assembly.experiments import build as build
     from pegasus_jax.assembly.experiments import compose as compose
@@ -67,6 +68,7 @@ if TYPE_CHECKING:
     from pegasus_jax.types import Dataset as Dataset
     from pegasus_jax.types import Dropout as Dropout
     from pegasus_jax.types import Dynamics as Dynamics
+    from pegasus_jax.types import Memory as Memory
     from pegasus_jax.types import ModelLearner as ModelLearner
     from pegasus_jax.types import Period as Period
     from pegasus_jax.types import Policy as Policy
@@ -111,7 +113,7 @@ _NAMES = {
     "policies.wrap": "of_pair",
     "pilco.rbf": "rbf",
     # the values that pass between them
-    "types": "Task Cost Trajectory Dataset Batch Dynamics Prediction Dropout Policy Scenarios Period Rollout"
+    "types": "Task Cost Trajectory Dataset Batch Dynamics Prediction Dropout Policy Memory Scenarios Period Rollout"
     " TrainState ModelLearner PolicyOptimizer RunState",
     "vectorized": "Vectorized",
 }
@@ -124,6 +126,7 @@ _FAMILIES = {
     "dropouts": "models.dropout",
     "gaussian": "math.gaussian",
     "matching": "imagine.matching",
+    "memory": "memory",
     "tasks": "tasks",
 }
 _RENAMED = {"Learner": "TrainState", "Fitter": "ModelLearner", "Searcher": "PolicyOptimizer"}

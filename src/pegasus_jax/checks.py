@@ -21,6 +21,8 @@ SIZES = {
     "substeps": 10**3,
     "anneal_trials": 10**4,
     "horizon": 10**5,
+    "history": 100,
+    "delay": 100,
     "eval_episodes": 10**5,
     "trials": 10**4,
     "rows": 10**7,

@@ -19,12 +19,14 @@ GYM = "gym"  # the task that `env=` and `cost=` describe
 MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe
 TASKS = ("cartpole", "double_cartpole", *(f"swimmer_{maneuver}" for maneuver in MANEUVERS), GYM, MJCF)
 OWN = (GYM, MJCF)
+EVERY = ("*",)
 
 SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
 MATCHINGS = ("always", "narrow", "never")
 COST_ESTIMATORS = ("gaussian", "particles")
 OBSERVATION_NOISES = ("model", "plant")
+VELOCITIES = ("none", "difference", "filter")
 INITS = ("previous", "better", "fresh")
 LEGS = (2, 6)
 SUCCESSORS = ("always", "better")
@@ -258,6 +260,31 @@ class Explore:
         checks.choice("explore.kind", self.kind, EXPLORATIONS)
 
 
+@dataclass(frozen=True)
+class Sensors:
+    """What a robot measures, and when; as `Config.sensors`."""
+
+    measured: tuple[int, ...] = setting((), "the entries of the observation that there are sensors for; []: all")
+    delay: int = setting(0, "control periods from a state until the policy sees it, or from a control until it acts")
+    velocity: str = setting(
+        "none", "the rates of what is measured are computed: by difference, or by filter, its low-pass; or none are"
+    )
+    cutoff: float | None = setting(None, "of sensors.velocity=filter [Hz]; null: a fifth of the control rate")
+
+    def __post_init__(self) -> None:
+        checks.typed("sensors", self)
+        checks.different("sensors.measured", self.measured)
+        checks.size("sensors.delay", self.delay, 0)
+        checks.choice("sensors.velocity", self.velocity, VELOCITIES)
+        if self.cutoff is not None:
+            checks.check_range("sensors.cutoff", self.cutoff, 0, open_low=True)
+            if self.velocity != "filter":
+                raise ConfigError(
+                    f"sensors.cutoff={self.cutoff:g} is of no use with sensors.velocity={self.velocity}; the nearest is"
+                    " sensors.velocity=filter"
+                )
+
+
 Model = BNN | GP | SSGP | Lagrangian
 
 
@@ -278,7 +305,9 @@ class Config:
     fit: Fit | LBFGS = Fit()
     search: Search | Analytic = Search()
     explore: Explore = Explore()
-    # The plant, where the task leaves it to you: of a gym's or an mjcf's task, and a swimmer's legs.
+    # The plant: its sensors, and what the task leaves to you: of a gym's or an mjcf's task, and a swimmer's legs.
+    sensors: Sensors = setting(Sensors(), "", EVERY)  # noqa: RUF009 (frozen)
+    history: int = setting(1, "observations and controls that make a state, the newest and those before it", EVERY)
     legs: int = setting(2, "that the swimmer drives: 2 or 6", ("swimmer_*",))
     env: str | None = setting(None, "the environment's Gymnasium id", (GYM,))
     mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", (MJCF,))
@@ -332,6 +361,12 @@ class Config:
             checks.check_range("dt", self.dt, 0, checks.SIZES["dt"], open_low=True)
         if self.horizon is not None:
             checks.size("horizon", self.horizon)
+        checks.size("history", self.history)
+        if self.history > 1 and self.sensors.velocity != "none":
+            raise ConfigError(
+                f"history={self.history} and sensors.velocity={self.sensors.velocity} both stand for rates; the nearest"
+                " is history=1"
+            )
         checks.check_range("seed", self.seed, 0, 2**32 - 1)
         checks.sizes("", self, "trials")
         checks.sizes("", self, "eval_episodes", low=0)

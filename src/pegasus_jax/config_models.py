@@ -8,8 +8,9 @@ from pegasus_jax import checks
 
 
 def setting(default: Any, text: str, of: tuple[str, ...] = ()) -> Any:
-    """A field with its help text, and where not every task uses it, the names of those that do, maybe with a *."""
-    return field(default=default, metadata={"help": f"of task={'|'.join(of)}: {text}" if of else text, "of": of})
+    """A field with its help text, and of a plant's own the names of the tasks that use it, maybe with a *."""
+    some = of and "*" not in of
+    return field(default=default, metadata={"help": f"of task={'|'.join(of)}: {text}" if some else text, "of": of})
 
 
 DROPOUTS = ("log_normal", "binary", "concrete", "gaussian", "sparse", "none")

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import interrupt
+from pegasus_jax import memory as recall
 from pegasus_jax.shapes import check_shape
 from pegasus_jax.types import Array, Key, Task, Trajectory
 
@@ -23,7 +24,7 @@ class Episode(NamedTuple):
 
 
 def run(key: Key, act: Callable[[Key, Array, Array], Array], task: Task) -> Trajectory:
-    """H control periods of act(key, t, x [D]) -> u [U] on the task's plant, from a random start.
+    """H control periods of act(key, t, what the policy sees [P]) -> u [U] on the task's plant, from a random start.
 
     The controller and the data see the state with sensor noise; the cost is of the true state. Where the task's `stop`
     says so it is over: the periods after that are no data, and cost `stop_cost`.
@@ -39,6 +40,7 @@ def run_with_trace(
         raise ValueError(f"task {task.name} has no plant in JAX; hand its episodes to add_episode")
     plant = task.plant
     begin, first, steps = jax.random.split(key, 3)
+    see, _, advance = recall.steps(task.memory)
     sensor_std = jnp.asarray(task.sensor_std, float)
 
     def measure(key: Key, state: object) -> Array:
@@ -46,29 +48,30 @@ def run_with_trace(
         return x + sensor_std * jax.random.normal(key, x.shape)
 
     def step(carry: tuple, t_and_key: tuple[Array, Key]) -> tuple[tuple, tuple[Array, Array, Array, Array, Any]]:
-        state, x = carry
+        state, x, m = carry
         t, key = t_and_key
         act_key, sensor_key = jax.random.split(key)
-        u = act(act_key, t, x)
+        u = act(act_key, t, see(m, x))
         check_shape("what policy.apply returns", u, (len(task.control_names),), "[U]")
         looked = look(state, u)
         state = plant.step(state, u)
         after = measure(sensor_key, state)
-        seen = plant.observe(state)
+        m = advance(m, x, u)
+        seen = recall.join(plant.observe(state), m)
         over = jnp.zeros((), bool) if task.stop is None else task.stop(seen) > 0.5
         cost = task.cost.of_state(seen)
         check_shape("the cost of one state", cost, ())
-        return (state, after), (after, u, cost, over, looked)
+        return (state, after, m), (after, u, cost, over, looked)
 
     state = plant.reset(begin)
     x = measure(first, state)
-    times = jnp.arange(task.horizon)
-    _, (xs, us, costs, over, looks) = jax.lax.scan(step, (state, x), (times, jax.random.split(steps, task.horizon)))
+    m, times = recall.begin(task.memory, begin, x), jnp.arange(task.horizon)
+    _, (xs, us, costs, over, looks) = jax.lax.scan(step, (state, x, m), (times, jax.random.split(steps, task.horizon)))
     xs = jnp.concatenate([x[None], xs])
     if task.stop is None:
-        return Trajectory(xs, us, costs), looks
+        return Trajectory(xs, us, costs, memory=m), looks
     length = jnp.where(jnp.any(over), jnp.argmax(over) + 1, task.horizon).astype(jnp.int32)
-    return Trajectory(xs, us, jnp.where(times < length, costs, task.stop_cost), length), looks
+    return Trajectory(xs, us, jnp.where(times < length, costs, task.stop_cost), length, m), looks
 
 
 def drive(seed: int, act: Callable[[int, np.ndarray], Any], task: Task) -> Episode:
@@ -110,13 +113,19 @@ def padded(trajectory: Trajectory, horizon: int) -> Trajectory:
         return jnp.pad(rows, [(0, size - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
 
     x, u, cost = pad(trajectory.x, horizon + 1), pad(trajectory.u, horizon), pad(trajectory.cost, horizon)
-    return Trajectory(x, u, cost, jnp.int32(length))
+    return Trajectory(x, u, cost, jnp.int32(length), trajectory.memory)
 
 
 def trimmed(trajectory: Trajectory) -> Trajectory:
     """The rows that took place, without a length: what is stored, and drawn."""
     length = len(trajectory.u) if trajectory.length is None else int(trajectory.length)
-    return Trajectory(trajectory.x[: length + 1], trajectory.u[:length], trajectory.cost[:length])
+    rows = trajectory.x[: length + 1], trajectory.u[:length], trajectory.cost[:length]
+    return Trajectory(*rows, memory=trajectory.memory)
+
+
+def states(task: Task, trajectory: Trajectory) -> Array:
+    """x' [H+1, D + M] along an episode: what its costs are of."""
+    return recall.join(jnp.asarray(trajectory.x), recall.replay(task.memory, trajectory))
 
 
 def charged(cost: Any, task: Task) -> np.ndarray:

@@ -1,6 +1,7 @@
 """The loop of Alg. 1 as three seams: collect (the plant), add_episode (the data), improve (the mind)."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -10,6 +11,7 @@ import optax
 from jax.core import Tracer
 
 from pegasus_jax import episode
+from pegasus_jax import memory as recall
 from pegasus_jax.episode import Episode
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
@@ -106,14 +108,16 @@ def experiment(
     posterior's place. With an environment instead of a plant in JAX, `episode` and `collect` are not pure, and `drive`
     is there.
     """
-    states, controls = len(task.state_names), len(task.control_names)
+    states, controls, memory = len(task.state_names), len(task.control_names), task.memory
+    see, given, advance = recall.steps(memory)
+    inputs, more = recall.given_size(memory, controls), 0 if task.hindsight is None else task.hindsight.more
 
     def init(key: Key) -> RunState:
         model_key, policy_key = jax.random.split(jax.random.fold_in(key, 0))
         model, controller = dynamics.init(model_key), policy.init(policy_key)
         return RunState(
             key,
-            dataset.empty(capacity, states, controls),
+            dataset.empty(capacity, states, inputs + more, len(memory.names)),
             TrainState(model, fit.init(model)),
             TrainState(controller, search.init(controller)),
             jnp.int32(0),
@@ -134,12 +138,18 @@ def experiment(
 
         return episode.run(run_key, control, task)
 
+    def reaction(params: Params, noise: Params, m: Any, x: Array) -> tuple[Array, Any]:
+        u = policy.apply(params, noise, see(m, x))
+        return u, advance(m, x, u)
+
     # What an episode on an environment asks of JAX, each compiled once.
-    plan_of, noise_of = (
+    plan_of, noise_of, begin = (
         jax.jit(explore),
         jax.jit(lambda key: jax.vmap(policy.sample)(jax.random.split(key, task.horizon))),
+        jax.jit(partial(recall.begin, memory)),
     )
-    react, cost_of = jax.jit(policy.apply), jax.jit(jax.vmap(task.cost.of_state))
+    react = jax.jit(reaction)
+    costs_of = jax.jit(lambda whole: jax.vmap(task.cost.of_state)(episode.states(task, whole)[1:]))
 
     def drive(key: Key, policy_params: Params, exploring: bool) -> Episode:
         """An episode on the environment, with the costs of its rows."""
@@ -148,17 +158,23 @@ def experiment(
         plan = np.asarray(plan_of(plan_key))
         noise = jax.tree.map(np.asarray, noise_of(noise_key))
         # Compiled before the robot moves: the first control is to be as quick as the others.
-        react(policy_params, jax.tree.map(lambda z: z[0], noise), np.zeros(states, np.float32))
+        resting = np.zeros(states, np.float32)
+        react(policy_params, jax.tree.map(lambda z: z[0], noise), begin(seed_key, resting), resting)
+        first = m = None
 
         def control(t: int, x: np.ndarray) -> np.ndarray:
+            nonlocal first, m
+            if t == 0:
+                first = m = begin(seed_key, x)
             if exploring:
                 return plan[t]
-            return np.asarray(react(policy_params, jax.tree.map(lambda z: z[t], noise), x))
+            u, m = react(policy_params, jax.tree.map(lambda z: z[t], noise), m, x)
+            return np.asarray(u)
 
         found = episode.drive(seed, control, task)
-        whole = episode.padded(found.trajectory, task.horizon)
-        cost = np.asarray(cost_of(whole.x[1:]))[: len(found.trajectory.u)]
-        return found._replace(trajectory=found.trajectory._replace(cost=cost))
+        ran = found.trajectory._replace(memory=first)
+        cost = np.asarray(costs_of(episode.padded(ran, task.horizon)))[: len(ran.u)]
+        return found._replace(trajectory=ran._replace(cost=cost))
 
     def driven(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
         if isinstance(key, Tracer):
@@ -181,9 +197,20 @@ def experiment(
         Raises ValueError for arrays of other shapes, and, outside of jit, for numbers that are not finite and where
         there is no room left.
         """
-        check_episode(state, trajectory)
-        data = dataset.add(state.data, trajectory, task.angles)
+        check_episode(state, trajectory, controls)
+        ran, m = as_modeled(trajectory)
+        data = dataset.add(state.data, ran, task.angles, m)
         return state._replace(data=data, trial=state.trial + 1, succeeded=episode.works(trajectory, task))
+
+    def as_modeled(trajectory: Trajectory) -> tuple[Trajectory, Array | None]:
+        """An episode as the model learns it, with its states and controls [H, V], and what was remembered [H+1, M]."""
+        m = recall.replay(memory, trajectory)
+        u = trajectory.u if m is None else jax.vmap(given)(m[:-1], trajectory.u)
+        if task.hindsight is None:
+            return trajectory._replace(u=u), m
+        length = len(u) if trajectory.length is None else trajectory.length
+        x, more = task.hindsight.states(trajectory.x, length, u)
+        return trajectory._replace(x=x, u=jnp.concatenate([u, more], 1)), m
 
     def learn(state: RunState, steps: int = fit_steps) -> tuple[RunState, FitInfo]:
         """Fit the model to the data (Alg. 1 line 5)."""
@@ -195,7 +222,9 @@ def experiment(
         return posterior if remember is None else remember(posterior, state)
 
     def adapted(params: Params, data: Dataset) -> Params:
-        return params if policy.adapt is None else policy.adapt(params, data)
+        if policy.adapt is None:
+            return params
+        return policy.adapt(params, data._replace(x=jax.vmap(see)(data.memory, data.x)))
 
     def improve_policy(
         state: RunState, first: Array | int = 0, steps: int = search_steps
@@ -273,7 +302,8 @@ def experiment(
         """
         posterior = posterior_of(state)
         key = trial_key(state.key, state.trial + 1, CALIBRATE)
-        found = calibration(key, posterior, trajectory, dynamics=dynamics, angles=task.angles)
+        ran, _ = as_modeled(trajectory)
+        found = calibration(key, posterior, ran._replace(u=ran.u[:, :inputs]), dynamics=dynamics, angles=task.angles)
         return jnp.where(state.trial >= max(1, explore_trials), found, jnp.nan)
 
     return Experiment(
@@ -294,9 +324,9 @@ def experiment(
     )
 
 
-def check_episode(state: RunState, trajectory: Trajectory) -> None:
+def check_episode(state: RunState, trajectory: Trajectory, controls: int) -> None:
     """Raise ValueError for an episode that is not one of the task's, as far as can be told."""
-    (states, controls), horizon = (state.data.x.shape[1], state.data.u.shape[1]), len(trajectory.u)
+    states, horizon = state.data.x.shape[1], len(trajectory.u)
     shapes = dict(x=(horizon + 1, states), u=(horizon, controls), cost=(horizon,))
     for name, shape in shapes.items():
         check_shape(f"an episode's {name}", getattr(trajectory, name), shape)

@@ -41,13 +41,13 @@ def check_params(name: str, params: Params) -> None:
         raise ValueError(f"{name} is a TrainState; expected its parameters, {name}=learner.params")
 
 
-def check_scenarios(scenarios: Scenarios) -> None:
-    """Raises ValueError unless the parts of the scenarios agree in K, H and D."""
+def check_scenarios(scenarios: Scenarios, memory: int = 0) -> None:
+    """Raises ValueError unless the parts of the scenarios agree in K, H and D, beside which M are of a memory."""
     check_shape("scenarios.start", scenarios.start, (None, None), "[K, D]")
-    (particles, states), horizon = scenarios.start.shape, jnp.shape(scenarios.match)[:1]
-    for name in ("match", "sensor"):
+    (particles, whole), horizon = scenarios.start.shape, jnp.shape(scenarios.match)[:1]
+    for name, size in (("match", whole), ("sensor", whole - memory)):
         noise = getattr(scenarios, name)
-        check_shape(f"scenarios.{name}", noise, (*horizon, particles, states) if horizon else (None,) * 3, "[H, K, D]")
+        check_shape(f"scenarios.{name}", noise, (*horizon, particles, size) if horizon else (None,) * 3, "[H, K, D]")
     for name in ("dynamics", "policy"):
         check_particles(f"scenarios.{name}", getattr(scenarios, name), particles)
 

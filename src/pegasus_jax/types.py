@@ -19,9 +19,10 @@ class Dataset(NamedTuple):
     """Transitions (x_t, u_t) -> x_{t+1} - x_t in arrays of fixed capacity, so that nothing recompiles as data grows."""
 
     x: Array  # [N, D] observed state
-    u: Array  # [N, U] control
+    u: Array  # [N, V] control as the model is given it; V = U unless the task's memory or hindsight says otherwise
     y: Array  # [N, D] change of state; differences of angles are wrapped to (-pi, pi]
     size: Array  # [] int32, rows in use; the rows beyond are zero
+    memory: Array | None = None  # [N, M] what was remembered there; None: the task has no memory
 
 
 class Batch(NamedTuple):
@@ -39,6 +40,7 @@ class Trajectory(NamedTuple):
     u: Array  # [H, U] control
     cost: Array  # [H] cost of the states 1..H, without sensor noise where the plant can tell
     length: Array | None = None  # [] int32, the control periods that took place; None: all H
+    memory: Array | None = None  # [M] at the start; the rest follows from x and u. None: none, or nothing was drawn
 
 
 class Prediction(NamedTuple):
@@ -51,11 +53,11 @@ class Prediction(NamedTuple):
 class Scenarios(NamedTuple):
     """Every random number of K imagined rollouts: with these, a rollout is a deterministic function (PEGASUS)."""
 
-    start: Array  # [K, D] first states, Alg. 3 line 5
+    start: Array  # [K, D + M] first states, Alg. 3 line 5, and what is remembered there
     dynamics: Params  # [K, ...] one draw of the model a particle, Alg. 3 line 1
     policy: Params  # [K, ...] one draw of the policy a particle, Alg. 3 line 2
     sensor: Array  # [H, K, D] standard normal, scales the predicted noise
-    match: Array  # [H, K, D] standard normal, redraws matched particles, Alg. 3 line 3
+    match: Array  # [H, K, D + M] standard normal, redraws matched particles, Alg. 3 line 3
 
 
 class Period(NamedTuple):
@@ -74,7 +76,7 @@ class Period(NamedTuple):
 class Rollout(NamedTuple):
     """K imagined trajectories."""
 
-    x: Array  # [H+1, K, D] states
+    x: Array  # [H+1, K, D + M] states, with what is remembered
     u: Array  # [H, K, U] controls
     std: Array  # [H, K, D] predicted noise of the states 1..H
 
@@ -106,6 +108,37 @@ class Dynamics(NamedTuple):
     deal: Callable[[Key, Any], Params] | None = None
 
 
+class Memory(NamedTuple):
+    """What a controller knows exactly beside its newest observation o [O]: m [M], which is computed and not predicted.
+
+    m is what is known before o comes. Where nothing is remembered, m is None (memory.py has the values).
+    """
+
+    names: tuple[str, ...]  # of its M entries
+    start: Callable[[Key, Array], Any]  # (key, o) -> m, at the first observation of an episode
+    advance: Callable[[Any, Array, Array], Any]  # (m, o, u [U]) -> m one control period later
+    shown: tuple[str, ...] = ()  # names of what the policy sees beside o; it sees P = O + len(shown) entries
+    show: Callable[[Any, Array], Array] = lambda m, o: o[:0]  # (m, o) -> these entries
+    shown_angles: tuple[int, ...] = ()  # which of these are angles [rad]
+    # (m, u [U]) -> what the model is given in place of the control u [V], such as one of some periods ago; None: u
+    applied: Callable[[Any, Array], Array] | None = None
+    # Whether m may be redrawn with x from their common Gaussian. Not what an episode keeps, and x depends on: a goal.
+    matched: bool = True
+    measured: tuple[int, ...] | None = None  # the entries of o that are looked at; None: all
+
+
+class Hindsight(NamedTuple):
+    """How the states of an episode are known afterwards, better than while it ran: what a model learns."""
+
+    # (observations [H+1, D], the last row that took place, controls as the model is given them [H, V]) -> (states
+    # [H+1, D], more controls [H, W]: what the fit is told beside them, and a rollout is not)
+    states: Callable[[Array, Array, Array], tuple[Array, Array]]
+    more: int  # W
+
+
+NO_MEMORY = Memory((), lambda key, o: None, lambda m, o, u: m)
+
+
 class Policy(NamedTuple):
     """A controller; `apply` returns controls inside the plant's limits."""
 
@@ -116,10 +149,11 @@ class Policy(NamedTuple):
     moments: Callable[[Params, Array, Array], Any] | None = None
     # (fresh params, data) -> params that take the data's large entries in their own units; None: not needed
     adapt: Callable[[Params, Dataset], Params] | None = None
+    memory: Memory = NO_MEMORY  # what it sees beside the observation, if it is more: x [D] above is then [P]
 
 
 class Cost(NamedTuple):
-    """What a search is to make small: a differentiable function of one state, in [0, 1]."""
+    """What a search is to make small: a differentiable function of one state, in [0, 1]. x is x' [D + M] in a task."""
 
     of_state: Callable[[Array], Array]  # x [D] -> scalar
     # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not in closed form, but by costs.expected_by_nodes
@@ -158,6 +192,8 @@ class Task(NamedTuple):
     # observation is x.
     circles: tuple[tuple[int, ...], ...] = ()
     starts: Any = None  # [N, D] states where episodes start, equally likely; None: N(start_mean, diag(start_std^2))
+    memory: Memory = NO_MEMORY
+    hindsight: Hindsight | None = None  # None: the states are as observed
 
     @property
     def may_end(self) -> bool:

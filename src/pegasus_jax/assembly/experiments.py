@@ -12,8 +12,10 @@ from pegasus_jax.assembly.pieces import dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import limits, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
-from pegasus_jax.imagine.visited import remember, remembering
+from pegasus_jax.imagine import visited
+from pegasus_jax.imagine.costs import blind_to_memory
 from pegasus_jax.sharding import over_particles
+from pegasus_jax.tasks.remembered import remembering
 from pegasus_jax.types import Array, Cost, Dynamics, ModelLearner, Policy, PolicyOptimizer, Task
 
 EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
@@ -44,10 +46,13 @@ def compose(
     does not suit the config: a cost without a width, for example, needs `search.cost_width_start=1`.
     """
     task = task._replace(cost=as_cost(task.cost if cost is None else cost))
+    task = remembering(config, task)
+    if task.memory.names:
+        task = blind(task)
     dynamics = dynamics or dynamics_of(config.model, task)
     visits = bool(config.search.visited_starts) and searcher is None
-    dynamics = remembering(dynamics) if visits else dynamics
-    policy = policy or policy_of(config.policy, task)
+    dynamics = visited.remembering(dynamics) if visits else dynamics
+    policy = (policy or policy_of(config.policy, task))._replace(memory=task.memory)
     searching = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)
     explore = config.explore
@@ -61,11 +66,19 @@ def compose(
         search_steps=config.search.steps,
         imagine=searching.imagine,
         expect=searching.expect if visits else None,
-        remember=remember if visits else None,
+        remember=visited.remember if visits else None,
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
         compare=config.successor == "better",
         capacity=config.trials * task.horizon,
+    )
+
+
+def blind(task: Task) -> Task:
+    """The task with its cost and its `stop`, which are of x [D], as functions of x' [D + M]."""
+    states, stop = len(task.state_names), task.stop
+    return task._replace(
+        cost=blind_to_memory(task.cost, states), stop=None if stop is None else lambda x: stop(x[:states])
     )
 
 

@@ -8,14 +8,16 @@ import optax
 
 from pegasus_jax import config as settings
 from pegasus_jax import tasks
-from pegasus_jax.assembly.searchers import limits, start
+from pegasus_jax.assembly.searchers import first_seen, limits
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.learn.fit import falling, minibatches
 from pegasus_jax.math import angles, gaussian
+from pegasus_jax.memory import given_size, seen_angles, seen_names
 from pegasus_jax.models import dropout
 from pegasus_jax.models.bnn import bnn
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.models.lagrangian import lagrangian
+from pegasus_jax.models.sharpened import sharpened
 from pegasus_jax.pilco.gp import gp
 from pegasus_jax.pilco.lbfgs import full_data
 from pegasus_jax.pilco.rbf import rbf
@@ -45,7 +47,10 @@ def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> ModelLe
 
 def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
     """The configured model of a task's dynamics. Raises ConfigError where the task does not suit it."""
-    shape: dict[str, Any] = dict(states=len(task.state_names), controls=len(task.control_names), angles=task.angles)
+    controls = given_size(task.memory, len(task.control_names))
+    shape: dict[str, Any] = dict(states=len(task.state_names), controls=controls, angles=task.angles)
+    if task.hindsight is not None and isinstance(config, settings.GP | settings.SSGP):
+        raise ConfigError("sensors.velocity= needs a model=lagrangian or another network; the nearest is history=2")
     match config:
         case settings.GP():
             return gp(**shape)
@@ -56,7 +61,10 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
             member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
         case settings.BNN():
             member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic)
-    return ensemble(member, config.ensemble_size) if config.ensemble_size > 1 else member
+    model = ensemble(member, config.ensemble_size) if config.ensemble_size > 1 else member
+    if task.hindsight is None:
+        return model
+    return sharpened(model, rates=task.rates, controls=len(task.control_names), inputs=controls)
 
 
 def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:
@@ -82,9 +90,10 @@ def dropout_of(config: settings.BNN | settings.Lagrangian) -> Dropout:
 def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task) -> Policy:
     """The configured controller of a task."""
     low, high = limits(task)
-    features = len(task.state_names) + len(task.angles)
+    names, turning = seen_names(task), seen_angles(task)
+    features = len(names) + len(turning)
     shared: dict[str, Any] = dict(
-        encode=partial(angles.encode, angles=task.angles),
+        encode=partial(angles.encode, angles=turning),
         controls=len(task.control_names),
         saturate=to_limits(SQUASHES[config.squash], low, high),
     )
@@ -93,7 +102,7 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
     match config:
         case settings.RBF():
             centers: dict[str, Any] = dict(
-                start=partial(start, task=task), waves=2 * len(task.angles), num_centers=config.num_centers
+                start=partial(first_seen, task=task), waves=2 * len(turning), num_centers=config.num_centers
             )
             return rbf(**shared, **centers, saturate_moments=saturate_moments)
         case settings.Linear():

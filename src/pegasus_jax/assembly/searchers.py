@@ -19,6 +19,7 @@ from pegasus_jax.imagine.visited import beside_visited, started
 from pegasus_jax.learn.multistart import best_of
 from pegasus_jax.learn.schedule import SearchTable, search_table
 from pegasus_jax.learn.search import Problem, searcher
+from pegasus_jax.memory import begin, steps
 from pegasus_jax.pilco import search as pilco
 from pegasus_jax.policies.scaled import inherited
 from pegasus_jax.sharding import Spread, together
@@ -50,6 +51,9 @@ MATCHINGS = {
     "never": Matching(lambda _: matching.keep, lambda of, _: cost.of_matched(of)),
 }
 
+# What an episode keeps, such as a goal, is not to be redrawn, nor averaged over before the cost is.
+UNMATCHED = Matching(lambda _: matching.keep, lambda of, _: cost.of_particles_mean(of))
+
 # (key, policy parameters, posterior) -> (rollout, cost [H, K])
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]
 
@@ -78,9 +82,10 @@ def search_of(
     noise = NoiseUse(search.policy_noise, search.state_noise, known)
     if isinstance(search, settings.Analytic):
         return analytic_search_of(search, task, dynamics, policy, noise)
-    matches = search.matching != "never"
-    if (matches or search.standardized_noise) and search.particles <= len(task.state_names):
-        states, what = len(task.state_names), "moment matching" if matches else "standardized noise"
+    matches = search.matching != "never" and task.memory.matched
+    states = len(task.state_names) + len(task.memory.names)
+    if (matches or search.standardized_noise) and search.particles <= states:
+        what = "moment matching" if matches else "standardized noise"
         raise ConfigError(
             f"search.particles={search.particles} is too few: {what} of {states} dimensions needs at least {states + 1}"
         )
@@ -94,7 +99,7 @@ def search_of(
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
     # A particle's cost is 1 / K of the objective.
     limit = None if (most := search.particle_grad_limit) is None else most / search.particles
-    match = MATCHINGS[search.matching].particles(task.angles)
+    match = matching_of(search, task).particles(task.angles)
     costs = costs_of(search, task)
     table = table_of(search)
     # What no row asks for is not compiled.
@@ -132,6 +137,11 @@ def search_of(
     return Searching(found, partial(imagine, blocks=blocks), lambda *given: jnp.mean(imagine(*given, blocks=mixed)[1]))
 
 
+def matching_of(search: settings.Search, task: Task) -> Matching:
+    """What search.matching names, where what the task remembers can be matched."""
+    return MATCHINGS[search.matching] if task.memory.matched else UNMATCHED
+
+
 def table_of(search: settings.Search) -> SearchTable:
     """What the configured search does, visit by visit."""
     return search_table(
@@ -156,6 +166,11 @@ def analytic_search_of(
     """PILCO's search. Raises ConfigError where a piece has no moments."""
     if task.stop is not None:
         raise ConfigError("algorithm=pilco propagates a Gaussian, which cannot stop; leave out stop=")
+    if task.memory.names:
+        raise ConfigError(
+            "algorithm=pilco propagates a Gaussian of the state alone; what is remembered beside it"
+            f" ({', '.join(task.memory.names[:3])}, ...) needs another algorithm="
+        )
     if dynamics.moments is None:
         raise ConfigError("algorithm=pilco needs a model with analytic moments: model=ssgp, model=gp")
     if policy.moments is None:
@@ -204,7 +219,7 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
         now = task.cost if width is None or task.cost.widen is None else task.cost.widen(width)
         if search.cost_estimator != "gaussian":
             return until_stop(task, cost.of_particles(now))
-        matched = MATCHINGS[search.matching].cost(now, task.angles)
+        matched = matching_of(search, task).cost(now, task.angles)
         return until_stop(task, either(refining, cost.of_particles_mean(now), matched))
 
     return costs
@@ -257,6 +272,12 @@ def start(key: Key, *, task: Task) -> Array:
         return jax.random.choice(key, jnp.asarray(task.starts, float))
     mean, std = jnp.asarray(task.start_mean, float), jnp.asarray(task.start_std, float)
     return mean + std * jax.random.normal(key, mean.shape)
+
+
+def first_seen(key: Key, *, task: Task) -> Array:
+    """What the policy sees [P] first, in an episode of the task."""
+    x, (see, *_) = start(key, task=task), steps(task.memory)
+    return see(begin(task.memory, key, x), x)
 
 
 def limits(task: Task) -> tuple[Array, Array]:

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Squash, Standardize, layers_of
+from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Recall, Squash, Standardize, layers_of
 from pegasus_jax.exports.learned import Learned, said
 
 HEADER = """\
@@ -40,8 +40,8 @@ HEADER = """\
 
 {arrays}
 
-/* Forget the episode so far. It remembers nothing; a controller that filters its sensors will. */
-static inline void {name}_reset(void) {{}}
+/* Forget the episode so far{forgets}. */
+{memory}static inline void {name}_reset(void) {{{reset}}}
 
 /* u [{controls}] for x [{observations}]; 0, or 1 where a number of x is not finite. */
 static inline int {name}_act(const {type} *x, {type} *u) {{
@@ -57,8 +57,8 @@ CHECK = """\
 #include "{name}.h"
 int main(void) {{
     {type} x[{observations}], u[{controls}];
-    while (fread(x, sizeof *x, {observations}, stdin) == {observations}) {{
-        {name}_reset();
+    for (int i = 0; fread(x, sizeof *x, {observations}, stdin) == {observations}; ++i) {{
+        if (i % {episode} == 0) {name}_reset();
         if ({name}_act(x, u) || fwrite(u, sizeof *u, {controls}, stdout) != {controls}) return 1;
     }}
     return 0;
@@ -73,12 +73,15 @@ def write(learned: Learned, name: str) -> bytes:
     """The header's text; its names begin with `name`. Raises ConfigError for a policy that is no list of layers."""
     layers, observations = layers_of(learned, "c"), len(learned.observation)
     real, suffix = TYPES[learned.dtype.name]
+    kept = next((layer for layer in layers if isinstance(layer, Recall)), None)
     code = [f"for (int i = 0; i < {observations}; ++i) if (!isfinite(x[i])) return 1;"]
     arrays, size = {}, 0
     for number, layer in enumerate(layers):
         lines, used, size = _printed(layer, number, size)
         code += lines
         arrays |= used
+    if kept is not None:
+        code += _remembered(kept)
     fill = {"T": real, "F": suffix, "P": name}
     return HEADER.format(
         title=said(learned.title),
@@ -90,6 +93,9 @@ def write(learned: Learned, name: str) -> bytes:
         observation=said(", ".join(learned.observation)),
         control=said(", ".join(learned.task.control_names)),
         period=float(learned.task.dt),
+        forgets=": there is nothing to forget" if kept is None else "; one controller of this kind in a program",
+        memory="" if kept is None else _memory(kept, name, real),
+        reset="" if kept is None else f" {name}_began = 0; ",
         arrays="\n".join(_table(f"{name}_{key}", value) for key, value in arrays.items()),
         code=textwrap.indent(
             "\n".join(re.sub(r"@([TFP])", lambda found: fill[found[1]], line) for line in code), "    "
@@ -104,11 +110,13 @@ def _printed(layer: Layer, i: int, size: int) -> tuple[list[str], dict[str, np.n
     """
     before = f"v{i - 1}"
     match layer:
+        case Recall():
+            return _recalled(layer, f"v{i}"), {"rest": layer.rest}, layer.size
         case Features(plain, angles):
-            lines, count = [f"@T v{i}[{layer.size}];"], len(angles)
-            lines += [f"v{i}[{place}] = x[{entry}];" for place, entry in enumerate(plain)]
+            lines, count, given = [f"@T v{i}[{layer.size}];"], len(angles), before if i else "x"
+            lines += [f"v{i}[{place}] = {given}[{entry}];" for place, entry in enumerate(plain)]
             for place, pair in enumerate(angles, start=len(plain)):
-                angle = f"x[{pair[0]}]" if len(pair) == 1 else f"atan2@F(x[{pair[1]}], x[{pair[0]}])"
+                angle = _entry(pair, given)
                 lines += [f"v{i}[{place}] = sin@F({angle});", f"v{i}[{place + count}] = cos@F({angle});"]
             return lines, {}, layer.size
         case Standardize(mean, scale):
@@ -157,6 +165,57 @@ def _printed(layer: Layer, i: int, size: int) -> tuple[list[str], dict[str, np.n
             return lines, {"low": low, "high": high, "middle": layer.middle, "half": layer.half}, len(low)
 
 
+def _entry(entries: tuple[int, ...], given: str = "x") -> str:
+    """An entry of the state, of one or two of the observation."""
+    first, *second = (f"{given}[{entry}]" for entry in entries)
+    return f"atan2@F({second[0]}, {first})" if second else first
+
+
+def _memory(layer: Recall, name: str, real: str) -> str:
+    """The declarations of what is remembered, at least one number each."""
+    n = len(layer.state)
+    sizes = {"past": layer.controls * len(layer.rest), "rows": layer.rows * n, "before": n, "rate": n}
+    return f"static int {name}_began = 0;\n" + "".join(
+        f"static {real} {name}_{key}[{max(size, 1)}];\n" for key, size in sizes.items()
+    )
+
+
+def _recalled(layer: Recall, v: str) -> list[str]:
+    """The lines that make what the policy sees of x, and of what is remembered."""
+    n, controls, rows = len(layer.state), layer.controls * len(layer.rest), layer.rows * len(layer.state)
+    lines = [f"@T {v}[{layer.size}];", *(f"{v}[{i}] = {_entry(entry)};" for i, entry in enumerate(layer.state))]
+    lines += [
+        "if (!@P_began) {",
+        f"    for (int i = 0; i < {controls}; ++i) @P_past[i] = @P_rest[i % {len(layer.rest)}];",
+        f"    for (int i = 0; i < {rows}; ++i) @P_rows[i] = {v}[i % {n}];",
+        f"    for (int i = 0; i < {n}; ++i) {{ @P_before[i] = {v}[i]; @P_rate[i] = 0; }}",
+        "    @P_began = 1;",
+        "}",
+    ]
+    if layer.rates:
+        lines += [f"@T change[{n}];", f"for (int i = 0; i < {n}; ++i) change[i] = {v}[i] - @P_before[i];"]
+        lines += [f"change[{i}] = atan2@F(sin@F(change[{i}]), cos@F(change[{i}]));" for i in layer.turning]
+        weight, dt = f"(@T){layer.weight!r}", f"(@T){layer.dt!r}"
+        lines.append(f"for (int i = 0; i < {n}; ++i) @P_rate[i] += {weight} * (change[i] / {dt} - @P_rate[i]);")
+    for name, first, size in (("past", n, controls), ("rows", n + controls, rows), ("rate", n + controls + rows, n)):
+        if size and (layer.rates or name != "rate"):
+            lines.append(f"for (int i = 0; i < {size}; ++i) {v}[{first} + i] = @P_{name}[i];")
+    return lines
+
+
+def _remembered(layer: Recall) -> list[str]:
+    """The lines after the control was computed: v0 begins with the state."""
+    n, lines = len(layer.state), []
+    for name, new, size, count in (
+        ("past", "u", len(layer.rest), layer.controls * len(layer.rest)),
+        ("rows", "v0", n, layer.rows * n),
+    ):
+        if count:
+            lines.append(f"for (int i = {count} - 1; i >= {size}; --i) @P_{name}[i] = @P_{name}[i - {size}];")
+            lines.append(f"for (int i = 0; i < {size}; ++i) @P_{name}[i] = {new}[i];")
+    return [*lines, f"for (int i = 0; i < {n}; ++i) @P_before[i] = v0[i];"]
+
+
 def _table(name: str, array: np.ndarray) -> str:
     """A table of numbers that read back to the last bit."""
     real, suffix = TYPES[array.dtype.name]
@@ -175,12 +234,16 @@ def compiler() -> list[str]:
     return found
 
 
-def run(path: Path, observations: np.ndarray) -> np.ndarray:
-    """What the header at `path` does for observations [N, O], compiled for this machine: controls [N, U]."""
+def run(path: Path, observations: np.ndarray, episode: int = 20) -> np.ndarray:
+    """What the header at `path` does for observations [N, O], of so many an episode, compiled here: controls [N, U]."""
     name, text = path.stem, path.read_text()
     controls = int(re.search(rf"define {name.upper()}_CONTROLS (\d+)", text)[1])  # type: ignore[index]
     check = CHECK.format(
-        name=name, type=TYPES[observations.dtype.name][0], observations=observations.shape[1], controls=controls
+        name=name,
+        type=TYPES[observations.dtype.name][0],
+        observations=observations.shape[1],
+        controls=controls,
+        episode=episode,
     )
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "check"

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Squash, Standardize, layers_of
+from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Recall, Squash, Standardize, layers_of
 from pegasus_jax.exports.learned import Learned, said
 
 MODULE = '''\
@@ -33,18 +33,7 @@ CONTROL = {control!r}
 PERIOD = {period!r}  # [s] from one control to the next
 
 
-class Controller:
-    """Call it with an observation [{observations}], in the order of OBSERVATION, for the control [{controls}]."""
-
-    def reset(self):
-        """Forget the episode so far. It remembers nothing; a controller that filters its sensors will."""
-
-    def __call__(self, observation):
-        return act(observation)
-
-
-def act(observation):
-    """The control [{controls}] for an observation [{observations}]. Raises ValueError unless all of it is finite."""
+{controller}
     x = np.asarray(observation, np.{dtype})
     if x.shape != ({observations},) or not np.isfinite(x).all():
         raise ValueError(f"an observation is {observations} finite numbers, not {{x}}")
@@ -60,18 +49,60 @@ def _array(dtype, shape, text):
 '''
 
 
+FORGETFUL = '''\
+class Controller:
+    """Call it with an observation [{observations}], in the order of OBSERVATION, for the control [{controls}]."""
+
+    def reset(self):
+        """Forget the episode so far: there is nothing to forget."""
+
+    def __call__(self, observation):
+        return act(observation)
+
+
+def act(observation):
+    """The control [{controls}] for an observation [{observations}]. Raises ValueError unless all of it is finite."""'''
+
+REMEMBERING = '''\
+class Controller:
+    """Call it with each observation [{observations}], in the order of OBSERVATION, for the control [{controls}]."""
+
+    def __init__(self):
+        self.reset()
+
+    def reset(self):
+        """Forget the episode so far: what is remembered begins with the next observation."""
+        self.memory = None
+
+    def __call__(self, observation):
+        control, self.memory = act(observation, self.memory)
+        return control
+
+
+def act(observation, memory=None):
+    """The control [{controls}] for an observation [{observations}], and what is remembered until the next one.
+
+    Without a memory an episode begins. Raises ValueError unless all of the observation is finite.
+    """'''
+
+
 def write(learned: Learned, name: str) -> bytes:
     """The module's text. Raises ConfigError for a policy that is no list of layers."""
-    code, arrays = [], {}
+    code, arrays, sizes = [], {}, (len(learned.observation), len(learned.task.control_names))
+    remembers = bool(learned.task.memory.names)
     for number, layer in enumerate(layers_of(learned, "numpy")):
         lines, used = _printed(layer, number)
         code += lines
         arrays |= used
+    if remembers:
+        code[-1] = code[-1].replace("return", "control =")
+        code += REMEMBERED
     text = MODULE.format(
         title=said(learned.title),
         name=name,
-        observations=len(learned.observation),
-        controls=len(learned.task.control_names),
+        observations=sizes[0],
+        controls=sizes[1],
+        controller=(REMEMBERING if remembers else FORGETFUL).format(observations=sizes[0], controls=sizes[1]),
         observation=learned.observation,
         control=tuple(learned.task.control_names),
         period=float(learned.task.dt),
@@ -85,10 +116,10 @@ def write(learned: Learned, name: str) -> bytes:
 def _printed(layer: Layer, i: int) -> tuple[list[str], dict[str, np.ndarray]]:
     """The lines of a layer, v to v, and the arrays that they name."""
     match layer:
+        case Recall():
+            return _recalled(layer)
         case Features(plain, angles):
-            entries = [
-                f"x[{pair[0]}]" if len(pair) == 1 else f"np.arctan2(x[{pair[1]}], x[{pair[0]}])" for pair in angles
-            ]
+            entries = [_entry(pair) for pair in angles]
             angle = [f"angle = np.array([{', '.join(entries)}], x.dtype)"] if angles else []
             parts = [f"x[{list(plain)}]"] * bool(plain) + ["np.sin(angle)", "np.cos(angle)"] * bool(angles)
             return [*angle, f"v = np.concatenate([{', '.join(parts)}])"], {}
@@ -112,6 +143,35 @@ def _printed(layer: Layer, i: int) -> tuple[list[str], dict[str, np.ndarray]]:
             return [*squash, limited], {"LOW": low, "HIGH": high, "MIDDLE": layer.middle, "HALF": layer.half}
 
 
+REMEMBERED = [
+    "past = np.concatenate([control, past])[: past.size]",
+    "rows = np.concatenate([q, rows])[: rows.size]",
+    "return control, (past, rows, q, rate)",
+]
+
+
+def _recalled(layer: Recall) -> tuple[list[str], dict[str, np.ndarray]]:
+    """The lines that make what the policy sees of x, and of what is remembered: x from now on."""
+    turn = f"change[{list(layer.turning)}]"
+    lines = [
+        f"q = np.array([{', '.join(map(_entry, layer.state))}], x.dtype)",
+        "if memory is None:",
+        f"    memory = np.tile(REST, {layer.controls}), np.tile(q, {layer.rows}), q, np.zeros_like(q)",
+        "past, rows, before, rate = memory",
+    ]
+    if layer.rates:
+        lines.append("change = q - before")
+        lines += [f"{turn} = np.arctan2(np.sin({turn}), np.cos({turn}))"] if layer.turning else []
+        lines.append(f"rate = rate + x.dtype.type({layer.weight!r}) * (change / x.dtype.type({layer.dt!r}) - rate)")
+    lines.append(f"x = np.concatenate([q, past, rows{', rate' * layer.rates}])")
+    return lines, {"REST": layer.rest}
+
+
+def _entry(entries: tuple[int, ...]) -> str:
+    """An entry of the state, of one or two of the observation."""
+    return f"x[{entries[0]}]" if len(entries) == 1 else f"np.arctan2(x[{entries[1]}], x[{entries[0]}])"
+
+
 def _stored(name: str, array: np.ndarray) -> str:
     """The lines that define an array, little end first."""
     little = array.astype(array.dtype.newbyteorder("<"))
@@ -121,7 +181,11 @@ def _stored(name: str, array: np.ndarray) -> str:
     )
 
 
-def run(path: Path, observations: np.ndarray) -> np.ndarray:
-    """What the module at `path` does for observations [N, O]: controls [N, U]."""
-    act = runpy.run_path(str(path))["act"]
-    return np.stack([act(x) for x in observations])
+def run(path: Path, observations: np.ndarray, episode: int = 20) -> np.ndarray:
+    """What the module at `path` does for observations [N, O], of so many an episode: controls [N, U]."""
+    control, found = runpy.run_path(str(path))["Controller"](), []
+    for number, x in enumerate(observations):
+        if number % episode == 0:
+            control.reset()
+        found.append(control(x))
+    return np.stack(found)

@@ -6,7 +6,17 @@ from typing import Any
 import numpy as np
 
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Squash, Standardize, layers_of
+from pegasus_jax.exports.layers import (
+    Dense,
+    Features,
+    Kernels,
+    Layer,
+    Recall,
+    Squash,
+    Standardize,
+    forgetful,
+    layers_of,
+)
 from pegasus_jax.exports.learned import Learned
 
 OPSET, IR = 17, 8  # of 2022: runtimes of today and of some years ago read them
@@ -45,6 +55,7 @@ class Graph:
 
 def write(learned: Learned, name: str) -> bytes:
     """The model, checked. Raises ConfigError for a policy that is no list of layers, or without the package."""
+    forgetful(learned, "onnx")
     graph = Graph()
     helper, real = graph.onnx.helper, graph.onnx.helper.np_dtype_to_tensor_dtype(learned.dtype)
     value = INPUT
@@ -65,6 +76,8 @@ def _added(graph: Graph, layer: Layer, v: str, dtype: np.dtype) -> str:
     """Add the nodes of a layer, v to the value that is returned."""
     node, constant = graph.node, graph.constant
     match layer:
+        case Recall():
+            raise AssertionError("a graph remembers nothing")
         case Features(plain, angles):
             waves = [_waves(graph, v, pair, dtype) for pair in angles]
             parts = [node("Gather", v, constant(plain, np.int64), axis=1)] if plain else []

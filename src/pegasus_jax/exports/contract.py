@@ -9,7 +9,9 @@ import numpy as np
 
 from pegasus_jax.exports.learned import Learned
 from pegasus_jax.exports.parity import Parity
+from pegasus_jax.memory import resting
 from pegasus_jax.runs.machine import about
+from pegasus_jax.tasks.remembered import kept_by
 
 
 def contract(learned: Learned, format: str, file: Path, data: bytes, parity: Parity, command: str) -> dict[str, Any]:
@@ -33,11 +35,24 @@ def contract(learned: Learned, format: str, file: Path, data: bytes, parity: Par
             for i, name in enumerate(learned.observation)
         ],
         "control": [named(name) | {"low": low, "high": high} for name, low, high in controls],
-        "filter": "none",
-        "history": "none",
+        **_memory(learned),
         "parity": {**parity._asdict(), "allowed": parity.allowed, "against": "pegasus_jax.controller"},
         "command": command,
         "versions": about(command)["versions"],
+    }
+
+
+def _memory(learned: Learned) -> dict[str, Any]:
+    """What the file remembers of an episode, from `reset` on: its filter, and past observations and controls."""
+    task = learned.task
+    if not task.memory.names:
+        return {"filter": "none", "history": "none"}
+    kept = kept_by(learned.config, task)
+    rest = resting(task).astype(float).tolist()
+    rates = {"rates_of": [*learned.observation], "computed_by": "difference", "weight_of_the_newest": kept.weight}
+    return {
+        "filter": rates if kept.rates else "none",
+        "history": {"controls": kept.controls, "observations": kept.rows, "controls_before_an_episode": rest},
     }
 
 

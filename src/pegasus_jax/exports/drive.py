@@ -9,18 +9,17 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import interrupt, tasks
 from pegasus_jax.checks import ConfigError, RunError, check_range
-from pegasus_jax.episode import Episode, drive
+from pegasus_jax.episode import Episode, drive, states
 from pegasus_jax.exports.watchdog import Watchdog
 from pegasus_jax.exports.write import export
-from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs import restore, store
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.runs.files import write_whole
+from pegasus_jax.tasks import sensed
 from pegasus_jax.types import Task, Trajectory
 
 SLACK = 0.1  # of a period, by which a control may follow the one before it too late
@@ -94,7 +93,7 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
     rows: list[Any] = []
 
     def save(ran: Episode) -> Drive:
-        seen = jnp.asarray(ran.trajectory.x)[1:]
+        seen = states(task, ran.trajectory)[1:] if len(ran.trajectory.u) else []
         cost = np.asarray(jax.vmap(task.cost.of_state)(seen) if len(seen) else [], np.float32)
         kept = ran._replace(trajectory=ran.trajectory._replace(cost=cost))  # type: ignore[arg-type]
         done = Drive(log, kept, task.dt, np.array(times[: len(ran.trajectory.u)]) - (times[0] if times else 0))
@@ -111,7 +110,7 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
 
     with Watchdog(limit, task.environment.close, last_words) as watch:
         on_time = task._replace(environment=timed(task.environment, task.dt, times, rows, watch.beat))
-        ran = drive(seed, lambda t, x: control(to_observation(x, task.circles)), on_time)
+        ran = drive(seed, lambda t, x: control(sensed.observation(x, task)), on_time)
     done = save(ran)
     if watch.fired:
         raise RunError(_stopped(task, limit, len(done.times), log))

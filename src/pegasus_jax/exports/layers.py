@@ -5,13 +5,36 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from pegasus_jax import memory as recall
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import MLP, RBF, Linear
 from pegasus_jax.exports.learned import Learned
 from pegasus_jax.math.circles import entries
 from pegasus_jax.pilco.rbf import regress
 from pegasus_jax.runs.restore import precision
-from pegasus_jax.types import Params, Task
+from pegasus_jax.tasks.remembered import kept_by, remembering
+from pegasus_jax.types import NO_MEMORY, Params
+
+
+class Recall(NamedTuple):
+    """v = the state [n] of the observation, then what is remembered of an episode; see tasks/remembered.py.
+
+    Past controls, newest first, then past states, newest first, then the rates of `positions` [n] of the state.
+    """
+
+    state: tuple[tuple[int, ...], ...]  # [n] (entry of the observation,), or those of a cosine and a sine of an angle
+    rest: np.ndarray  # [U] the controls before the episode
+    controls: int  # past ones
+    rows: int  # past states
+    turning: tuple[int, ...]  # the entries of the state that are angles; of their differences no turn is counted
+    rates: bool
+    weight: float  # of the newest difference in a rate
+    dt: float  # [s]
+
+    @property
+    def size(self) -> int:
+        """Entries of v."""
+        return len(self.state) * (1 + self.rows + self.rates) + self.controls * len(self.rest)
 
 
 class Features(NamedTuple):
@@ -70,7 +93,7 @@ class Squash(NamedTuple):
         return (self.high - self.low) / 2
 
 
-Layer = Features | Standardize | Dense | Kernels | Squash
+Layer = Recall | Features | Standardize | Dense | Kernels | Squash
 
 
 def layers_of(learned: Learned, format: str) -> tuple[Layer, ...]:
@@ -91,15 +114,42 @@ def layers_of(learned: Learned, format: str) -> tuple[Layer, ...]:
         case _:
             raise ConfigError(f"format={format} cannot write this policy; the nearest is format=stablehlo")
     low, high = (_array(limit, dtype) for limit in (learned.task.control_low, learned.task.control_high))
-    return (_features(learned.task), *middle, Squash(settings.squash, low, high))
+    return (*_features(learned), *middle, Squash(settings.squash, low, high))
 
 
-def _features(task: Task) -> Features:
-    """Where the features of the state are in the observation."""
-    size, pair_at = len(task.state_names) + len(task.circles), {min(pair): pair for pair in task.circles}
-    kept = entries(size, task.circles)
-    plain = tuple(entry for i, entry in enumerate(kept) if i not in task.angles)
-    return Features(plain, tuple(tuple(pair_at.get(kept[i], (kept[i],))) for i in task.angles))
+def forgetful(learned: Learned, format: str) -> None:
+    """Raises ConfigError for a policy that remembers, which a format cannot express."""
+    if learned.task.memory.names:
+        raise ConfigError(
+            f"format={format} cannot write a controller that remembers {learned.task.memory.names[0]};"
+            " the nearest are format=numpy and format=c"
+        )
+
+
+def _features(learned: Learned) -> tuple[Layer, ...]:
+    """Where the features of what the policy sees are in the observation, and in what is remembered."""
+    task, measured = learned.task, recall.measured(learned.task)
+    pair_at = {min(pair): tuple(pair) for pair in task.circles}
+    kept = [pair_at.get(entry, (entry,)) for entry in entries(len(measured) + len(task.circles), task.circles)]
+    turning = recall.seen_angles(task)
+    if not task.memory.names:
+        plain = tuple(entry for i, (entry, *_) in enumerate(kept) if i not in turning)
+        return (Features(plain, tuple(kept[i] for i in turning)),)
+    kept_of, own = kept_by(learned.config, task), remembering(learned.config, task._replace(memory=NO_MEMORY))
+    if own.memory.shown != task.memory.shown:
+        raise ConfigError(f"{', '.join(task.memory.shown)}: no file can remember that; pegasus_jax.controller does")
+    layer = Recall(
+        state=tuple(kept),
+        rest=_array(recall.resting(task), learned.dtype),
+        controls=kept_of.controls,
+        rows=kept_of.rows,
+        turning=tuple(measured.index(i) for i in task.angles if i in measured),
+        rates=kept_of.rates,
+        weight=kept_of.weight,
+        dt=float(task.dt),
+    )
+    seen = range(layer.size)
+    return layer, Features(tuple(i for i in seen if i not in turning), tuple((i,) for i in turning))
 
 
 def _network(settings: MLP, params: Params, dtype: np.dtype) -> list[Layer]:

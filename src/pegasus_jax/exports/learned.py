@@ -2,13 +2,15 @@
 
 import re
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
+from pegasus_jax import memory as recall
 from pegasus_jax.config import Config
 from pegasus_jax.math.circles import entries, to_state
+from pegasus_jax.tasks import sensed
 from pegasus_jax.types import Array, Params, Policy, Task
 
 
@@ -35,8 +37,9 @@ class Learned(NamedTuple):
     @property
     def observation(self) -> tuple[str, ...]:
         """Names of the entries of an observation [O]; those of a cosine and a sine are x0, x1, ..."""
-        task, size = self.task, len(self.task.state_names) + len(self.task.circles)
-        kept = dict(zip(entries(size, task.circles), task.state_names, strict=True))
+        task, measured = self.task, recall.measured(self.task)
+        size = len(measured) + len(task.circles)
+        kept = dict(zip(entries(size, task.circles), (task.state_names[i] for i in measured), strict=True))
         paired = {entry for pair in task.circles for entry in pair}
         return tuple(f"x{i}" if i in paired else kept[i] for i in range(size))
 
@@ -50,6 +53,22 @@ def function(learned: Learned) -> Callable[[Array], Array]:
             return learned.policy.apply(learned.params, None, to_state(observation, learned.task.circles))
 
     return act
+
+
+def along(learned: Learned) -> Callable[[Array], Array]:
+    """The policy as a function of an episode's observations [L, O], to be traced: the controls [L, U]."""
+    task, memory = learned.task, learned.task.memory
+    see, _, advance = recall.steps(memory)
+
+    def act(m: Any, o: Array) -> tuple[Any, Array]:
+        u = learned.policy.apply(learned.params, None, see(m, o))
+        return advance(m, o, u), u
+
+    def episode(observations: Array) -> Array:
+        o = sensed.state(observations, task)
+        return jax.lax.scan(act, recall.begin(memory, jax.random.key(0), o[0]), o)[1]
+
+    return episode
 
 
 def said(text: str) -> str:

@@ -2,18 +2,20 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from pegasus_jax.checks import RunError
-from pegasus_jax.exports.learned import Learned, function
-from pegasus_jax.math.circles import to_observation
+from pegasus_jax.exports.learned import Learned, along
 from pegasus_jax.runs import store
+from pegasus_jax.runs.controller import Controller
+from pegasus_jax.tasks import sensed
 from pegasus_jax.types import Task
 
 OBSERVATIONS = 1000  # half of them stored, as far as there are so many
+EPISODE = 20  # observations between two resets of a controller that remembers
 ALLOWED = 1e-5  # of the control range, beside what the policy and the file round
 
 
@@ -43,24 +45,28 @@ def observations(run: Path, task: Task) -> tuple[np.ndarray, int]:
     seen = [np.asarray(episode.trajectory.x, float) for episode in episodes if episode is not None]
     start, std = np.asarray(task.start_mean, float), np.asarray(task.start_std, float)
     every = np.concatenate([*seen, [start - std, start + std]])
-    stored = draw.permutation(every[:-2])[: OBSERVATIONS // 2]
+    # One that remembers is given them in their order.
+    stored = (every[:-2] if task.memory.names else draw.permutation(every[:-2]))[: OBSERVATIONS // 2]
     low, high = every.min(0), every.max(0)
     margin = (high - low) / 2
     others = draw.uniform(low - margin, high + margin, (OBSERVATIONS - len(stored), len(low)))
-    return to_observation(np.concatenate([stored, others]), task.circles), len(stored)
+    return sensed.observation(np.concatenate([stored, others]), task), len(stored)
 
 
-def compared(
-    run: Callable[[np.ndarray], np.ndarray], learned: Learned, reference: Callable[[Any], np.ndarray], folder: Path
-) -> Parity:
+def compared(run: Callable[[np.ndarray], np.ndarray], learned: Learned, reference: Controller, folder: Path) -> Parity:
     """What `run`, the file, makes of observations [N, O] of the run in `folder`, beside `reference`: its `controller`.
 
-    Raises RunError where the difference is more than is allowed.
+    One that remembers is reset every 20 observations. Raises RunError where the difference is more than is allowed.
     """
     task = learned.task
     given, stored = observations(folder, task)
     given = given.astype(learned.dtype)
-    expected, found = np.stack([reference(x) for x in given]), run(given)
+    expected = []
+    for number, x in enumerate(given):
+        if number % EPISODE == 0:
+            reference.reset()
+        expected.append(reference(x))
+    expected, found = np.stack(expected), run(given)
     if found.shape != expected.shape:
         raise RunError(f"the file returns controls {[*found.shape]}, the policy {[*expected.shape]}; it was not kept")
     span = np.asarray(task.control_high) - np.asarray(task.control_low)
@@ -78,5 +84,7 @@ def compared(
 
 def exact(learned: Learned, given: np.ndarray) -> np.ndarray:
     """The controls [N, U] of a policy in double precision, with the same weights and observations [N, O]."""
+    size = given.shape[-1]
     with jax.enable_x64(True):
-        return np.asarray(jax.jit(jax.vmap(function(learned)))(given.astype(np.float64)))
+        episodes = jax.jit(jax.vmap(along(learned)))(given.astype(np.float64).reshape(-1, EPISODE, size))
+    return np.asarray(episodes).reshape(len(given), -1)

@@ -14,6 +14,7 @@ from pegasus_jax.shapes import check_shape
 from pegasus_jax.types import Array, Cost
 
 __all__ = [
+    "blind_to_memory",
     "expectation",
     "expected_by_nodes",
     "mean",
@@ -64,6 +65,16 @@ def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Ar
     up, down = at(jnp.asarray(unit[angle] * np.pi / 2)), at(jnp.asarray(-unit[angle] * np.pi / 2))
     cosine = (origin - at(jnp.asarray(unit[angle] * np.pi))) / 2
     return jnp.concatenate([linear, (up - down) / 2, cosine]).T, origin - jnp.sum(cosine, 0)
+
+
+def blind_to_memory(cost: Cost, states: int) -> Cost:
+    """The cost of x' [D + M], what is remembered beside x, whose first D entries a cost of x [D] is of."""
+    expected, widen = cost.expected, cost.widen
+    return Cost(
+        lambda x: cost.of_state(x[:states]),
+        None if expected is None else lambda mean, cov: expected(mean[:states], cov[:states, :states]),
+        None if widen is None else lambda factor: blind_to_memory(widen(factor), states),
+    )
 
 
 def expectation(cost: Cost) -> Expected:

@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from pegasus_jax import memory as recall
 from pegasus_jax.shapes import check_params, check_scenarios, check_shape
 from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenarios
 from pegasus_jax.vectorized import for_particles
@@ -38,35 +39,40 @@ def rollout(
 
     Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match` is
     `matching.match` or `matching.keep`. No gradient flows through the predicted noise. With a `limit`, none goes back
-    through a particle's state that is longer than that.
+    through a particle's state that is longer than that. What the policy remembers is of what it observed, noise
+    included.
 
     Raises ValueError, while it is traced, where shapes do not agree; the message names the argument.
     """
     check_params("policy_params", policy_params)
-    check_scenarios(scenarios)
+    check_scenarios(scenarios, len(policy.memory.names))
     act = jax.vmap(policy.apply, (None, 0, 0))
     predict = for_particles(dynamics.apply)
+    see, given, advance = (jax.vmap(function) for function in recall.steps(policy.memory))
+    start, states = scenarios.start, scenarios.sensor.shape[-1]
 
     def step(carry: tuple[Array, Array], draws: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple]:
-        x, seeing = carry
+        state, seeing = carry
         sensor, redraw = draws
         if limit is not None:
-            x = limited(x, limit)
-        u = act(policy_params, scenarios.policy, x + noise.policy * seeing)
+            state = limited(state, limit)
+        x, m = recall.split(state, states)
+        o = x + noise.policy * seeing
+        u = act(policy_params, scenarios.policy, see(m, o))
         check_shape("what policy.apply returns for K particles", u, (len(x), None), "[K, U]")
-        change = predict(posterior, scenarios.dynamics, x, u)
+        change = predict(posterior, scenarios.dynamics, x, given(m, u))
         for name, value in change._asdict().items():
             check_shape(f"{name} of what dynamics.apply returns for K particles", value, x.shape, "[K, D]")
         std = jax.lax.stop_gradient(change.std)
         blur = std * sensor
-        after = match(x + change.mean + noise.state * blur, redraw)
+        after = match(recall.join(x + change.mean + noise.state * blur, advance(m, o, u)), redraw)
         seeing = blur if noise.sensors is None else noise.sensors * sensor
         return (after, seeing), (after, u, std)
 
-    start = scenarios.start
     draws = (scenarios.sensor, scenarios.match)
     unroll = UNROLL.get(jax.default_backend(), 1)
-    _, (x, u, std) = jax.lax.scan(step, (start, jnp.zeros_like(start)), draws, unroll=unroll)
+    begun = start, jnp.zeros_like(start[:, :states])
+    _, (x, u, std) = jax.lax.scan(step, begun, draws, unroll=unroll)
     return Rollout(jnp.concatenate([start[None], x]), u, std)
 
 

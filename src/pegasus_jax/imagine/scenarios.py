@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
+from pegasus_jax import memory as recall
 from pegasus_jax.math.linalg import standardize
 from pegasus_jax.sharding import Spread, together
 from pegasus_jax.types import Array, Dynamics, Key, Params, Period, Policy, Scenarios
@@ -34,7 +35,7 @@ def blocks(
     standardized_noise: bool,
     spread: Spread = together,
 ) -> Blocks:
-    """How each part of the scenarios is drawn.
+    """How each part of the scenarios is drawn; `start` draws a first state [D], the policy's memory what is known.
 
     With `standardized_noise`, the normal draws of every time step have exactly zero mean and unit covariance over the
     particles, so that matched particles have exactly the moments asked for. `spread` lays particles out over devices.
@@ -45,18 +46,22 @@ def blocks(
     def each(sample: Callable[[Key], Params], key: Key) -> Params:
         return spread(sample(jax.random.split(key, particles)), 0)
 
-    def normal(key: Key, _: Params) -> Array:
-        states = jax.eval_shape(start, key).shape[0]
+    def first(key: Key) -> Array:
+        x = start(key)
+        return recall.join(x, recall.begin(policy.memory, key, x))
+
+    def normal(key: Key, _: Params, *, like: Callable[[Key], Array]) -> Array:
+        states = jax.eval_shape(like, key).shape[0]
         # Drawn as one long row: the same numbers, by loops that need not stop every few dimensions.
         z = jax.random.normal(key, (horizon * particles * states,)).reshape(horizon, particles, states)
         return spread(standardize(z) if standardized_noise else z, 1)
 
     return Blocks(
-        start=lambda key, _: each(jax.vmap(start), key),
+        start=lambda key, _: each(jax.vmap(first), key),
         dynamics=lambda key, posterior: each(lambda keys: deal(keys, posterior), key),
         policy=lambda key, _: each(jax.vmap(policy.sample), key),
-        sensor=normal,
-        match=normal,
+        sensor=partial(normal, like=start),
+        match=partial(normal, like=first),
     )
 
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 
 from pegasus_jax.imagine.scenarios import Block
 from pegasus_jax.math.angles import difference
+from pegasus_jax.memory import join, split
 from pegasus_jax.types import Array, Dynamics, Key, Params, Prediction, RunState, Scenarios
 from pegasus_jax.vectorized import Vectorized, for_particles
 
@@ -23,14 +24,14 @@ class Visited(NamedTuple):
     """A posterior, and states of the data that it was learned from."""
 
     posterior: Any
-    states: Array  # [512, D]
+    states: Array  # [512, D + M]
     succeeded: Array  # [] bool, whether the newest episode did
 
 
 def remember(posterior: Any, state: RunState) -> Visited:
     """The posterior with rows evenly spaced in a run's data, repeated where it has few."""
     rows = jnp.arange(STATES) * state.data.size // STATES
-    return Visited(posterior, state.data.x[rows], state.succeeded)
+    return Visited(posterior, join(state.data.x, state.data.memory)[rows], state.succeeded)
 
 
 def remembering(dynamics: Dynamics) -> Dynamics:
@@ -53,8 +54,8 @@ def remembering(dynamics: Dynamics) -> Dynamics:
 class Starts(NamedTuple):
     """Two first states of each particle: the scenarios of a search have one of them, by what it does."""
 
-    own: Array  # [K, D] as the task's episodes begin
-    mixed: Array  # [K, D] the same, of some particles one that the plant has visited
+    own: Array  # [K, D + M] as the task's episodes begin
+    mixed: Array  # [K, D + M] the same, of some particles one that the plant has visited
 
 
 def beside_visited(start: Block, share: float, angles: tuple[int, ...], around: Array) -> Block:
@@ -67,7 +68,8 @@ def beside_visited(start: Block, share: float, angles: tuple[int, ...], around: 
         own = start(key, given)
         chosen, row = jax.random.split(jax.random.fold_in(key, _VISITED))
         states = given.states[jax.random.randint(row, own.shape[:1], 0, STATES)]
-        near = (around + difference(states, around, angles)).astype(own.dtype)
+        x, m = split(states, around.shape[0])
+        near = join((around + difference(x, around, angles)).astype(own.dtype), m)
         elsewhere = jax.random.bernoulli(chosen, share, (len(own), 1)) & given.succeeded
         return Starts(own, jnp.where(elsewhere, near, own))
 

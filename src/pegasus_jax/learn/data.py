@@ -9,14 +9,14 @@ from pegasus_jax.types import Array, Batch, Dataset, Key, Trajectory
 __all__ = ["add", "empty", "grow", "minibatch"]
 
 
-def empty(capacity: int, states: int, controls: int) -> Dataset:
+def empty(capacity: int, states: int, controls: int, memory: int = 0) -> Dataset:
     """A data set of `capacity` rows, none in use."""
-    zeros = jnp.zeros
-    return Dataset(zeros((capacity, states)), zeros((capacity, controls)), zeros((capacity, states)), jnp.int32(0))
+    rows = [jnp.zeros((capacity, size)) for size in (states, controls, states)]
+    return Dataset(*rows, jnp.int32(0), jnp.zeros((capacity, memory)) if memory else None)
 
 
-def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...]) -> Dataset:
-    """The data set with the transitions of an episode behind it (Alg. 1 line 4).
+def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...], memory: Array | None = None) -> Dataset:
+    """The data set with the transitions of an episode behind it (Alg. 1 line 4), and what was remembered [H+1, M].
 
     Of an episode that ended early only the rows that took place. Rows for which there is no room are left out, and what
     is there stays: the caller sizes a data set for the whole run (trials x horizon).
@@ -26,16 +26,15 @@ def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...]) -> Datas
     rows = jnp.arange(horizon)
     place = jnp.where(rows < length, data.size + rows, capacity)  # beyond the end: dropped
     y = difference(trajectory.x[1:], trajectory.x[:-1], angles)
-    new = trajectory.x[:-1], trajectory.u, y
-    x, u, y = (old.at[place].set(rows, mode="drop") for old, rows in zip(data[:3], new, strict=True))
-    return Dataset(x, u, y, jnp.minimum(data.size + length, capacity).astype(jnp.int32))
+    new = Dataset(trajectory.x[:-1], trajectory.u, y, data.size, None if memory is None else memory[:-1])
+    placed = jax.tree.map(lambda old, rows: old if old.ndim == 0 else old.at[place].set(rows, mode="drop"), data, new)
+    return placed._replace(size=jnp.minimum(data.size + length, capacity).astype(jnp.int32))
 
 
 def grow(data: Dataset, capacity: int) -> Dataset:
     """The same data with room for `capacity` rows, at least as many as now."""
     more = capacity - data.x.shape[0]
-    x, u, y = (jnp.pad(rows, ((0, more), (0, 0))) for rows in data[:3])
-    return Dataset(x, u, y, data.size)
+    return jax.tree.map(lambda rows: jnp.pad(rows, ((0, more), (0, 0))) if rows.ndim else rows, data)
 
 
 def minibatch(key: Key, data: Dataset, rows: int) -> Batch:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 import jax.numpy as jnp
 
 from pegasus_jax.math.angles import encode
+from pegasus_jax.memory import seen_angles
 from pegasus_jax.policies.squash import SQUASHES, to_limits
 from pegasus_jax.types import Array, Key, Params, Policy, Task
 
@@ -14,8 +15,10 @@ def of_pair(
 ) -> Policy:
     """u = apply(params, features [F]) [U], any real numbers, saturated to the task's limits by tanh or sine.
 
-    The features are those of every other controller: the state with its angles as sines and cosines (`angles.encode`).
+    The features are those of every other controller: what the policy sees, with its angles as sines and cosines
+    (`angles.encode`): the state, and what the task's memory shows.
     """
     low, high = jnp.asarray(task.control_low, float), jnp.asarray(task.control_high, float)
     saturate = to_limits(SQUASHES[squash], low, high)
-    return Policy(init, lambda key: (), lambda params, noise, x: saturate(apply(params, encode(x, task.angles))))
+    turning = seen_angles(task)
+    return Policy(init, lambda key: (), lambda params, noise, x: saturate(apply(params, encode(x, turning))))

@@ -76,9 +76,10 @@ def costed(job: Job, ran: Episode, trial: int) -> Episode:
     Where they are not finite then either, the writer is told, with trial and observation.
     """
     x = np.asarray(ran.trajectory.x)
-    cost = np.asarray(jax.vmap(job.experiment.task.cost.of_state)(jnp.asarray(x[1:])))
+    task = job.experiment.task
+    cost = np.asarray(jax.vmap(task.cost.of_state)(episode.states(task, ran.trajectory)[1:]))
     for (t,) in np.argwhere(~np.isfinite(cost))[:1]:
-        seen = to_observation(x[t + 1], job.experiment.task.circles).tolist()
+        seen = to_observation(x[t + 1], task.circles).tolist()
         found = f"the cost of the observation {seen} is {cost[t]}"
         job.writer.problem(f"trial {trial}: {found}; mend the cost")
     return ran._replace(trajectory=ran.trajectory._replace(cost=cost))

@@ -79,9 +79,14 @@ def check_used(task: str, given: Mapping[str, Any]) -> None:
 
 
 def used_by() -> dict[str, tuple[str, ...]]:
-    """Setting -> the tasks that use it, of those settings that not every task uses."""
-    names = [f.name for f in dataclasses.fields(Config) if f.metadata.get("of")]
-    return {name: tuple(task for task in TASKS if uses(task, name)) for name in names}
+    """Setting -> the tasks that use it, of those settings that describe a plant."""
+    found: dict[str, tuple[str, ...]] = {}
+    for f in dataclasses.fields(Config):
+        if f.metadata.get("of"):
+            using, inner = tuple(task for task in TASKS if uses(task, f.name)), getattr(Config, f.name)
+            names = leaves(inner, f"{f.name}.") if dataclasses.is_dataclass(inner) else [f.name]
+            found |= dict.fromkeys(names, using)
+    return found
 
 
 def _nearest_of(task: str, choices: Sequence[str]) -> str:

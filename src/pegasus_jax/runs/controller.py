@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pegasus_jax.math.circles import to_state
+from pegasus_jax import memory as recall
 from pegasus_jax.runs import restore
+from pegasus_jax.tasks import sensed
+from pegasus_jax.types import Array, Params
 
 
 class Controller:
@@ -23,13 +25,25 @@ class Controller:
     def __init__(self, run: Path, trial: restore.Trial) -> None:
         config, experiment, state = restore.restored(run, trial)
         self.trial = int(state.trial)
-        circles = experiment.task.circles
-        self._params, self._size = state.policy.params, len(experiment.task.state_names) + len(circles)
+        task, memory = experiment.task, experiment.task.memory
+        see, _, advance = recall.steps(memory)
+        self._params, self._size = state.policy.params, len(recall.measured(task)) + len(task.circles)
         double = config.x64
         self._type, self._width = (np.float64, partial(jax.enable_x64, True)) if double else (np.float32, nullcontext)
+
+        def start(x: Array) -> Array | None:
+            return recall.begin(memory, jax.random.key(0), sensed.state(x, task))
+
+        def act(params: Params, m: Array | None, x: Array) -> tuple[Array, Array | None]:
+            o = sensed.state(x, task)
+            u = experiment.policy.apply(params, None, see(m, o))
+            return u, advance(m, o, u)
+
         with restore.precision(config):
-            act = jax.jit(lambda params, x: experiment.policy.apply(params, None, to_state(x, circles)))
-            self._act = act.lower(self._params, jnp.zeros(self._size, self._type)).compile()
+            x = jnp.zeros(self._size, self._type)
+            self._start = jax.jit(start).lower(x).compile()
+            self._act = jax.jit(act).lower(self._params, jax.eval_shape(start, x), x).compile()
+        self.reset()
 
     def __call__(self, x: ArrayLike) -> np.ndarray:
         """The control u [U] for an observation x [O]. Raises ValueError unless that is O finite numbers."""
@@ -37,10 +51,14 @@ class Controller:
         if x.shape != (self._size,) or not np.isfinite(x).all():
             raise ValueError(f"an observation is {self._size} finite numbers, not {x}")
         with self._width():
-            return np.array(self._act(self._params, x))
+            m = self._start(x) if self._new else self._memory
+            u, self._memory = self._act(self._params, m, x)
+            self._new = False
+            return np.array(u)
 
     def reset(self) -> None:
-        """Forget the episode so far. A policy of today remembers nothing; one that filters its sensors will."""
+        """Forget the episode so far: what is remembered begins with the next observation."""
+        self._memory, self._new = None, True
 
 
 def controller(run: str | Path, trial: restore.Trial = restore.BEST) -> Controller:

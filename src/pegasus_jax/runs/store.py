@@ -4,7 +4,8 @@
         run.json             versions, machine, commands, and the facts of the task (facts.py)
         episodes/0001.npz    of L <= H control periods: x [L+1, D], u [L, U], cost [L], how it ended, the policy that
                              ran, names, dt; written before anything else happens to it. Where x has angles for
-                             the cosines and sines that its user observes, also observation [L+1, O] and circles
+                             the cosines and sines that its user observes, also observation [L+1, O] and circles;
+                             of a controller that remembers, memory [M] at the start
         imagined/0001.npz    particles after trial 1: x [H+1, K, D], u [H, K, U], cost [H, K]
         trials.jsonl         one JSON object a trial
         checkpoints/0001/    the state after trial 1, with 0001.json: the SHA-256 of each of its files
@@ -153,7 +154,8 @@ def episode_arrays(
 ) -> dict[str, Any]:
     """What the file of an episode holds, by name."""
     length = len(episode.u) if episode.length is None else int(episode.length)
-    arrays: dict[str, Any] = dict(
+    arrays: dict[str, Any] = {} if episode.memory is None else dict(memory=np.asarray(episode.memory))
+    arrays |= dict(
         x=np.asarray(episode.x)[: length + 1], u=np.asarray(episode.u)[:length], cost=np.asarray(episode.cost)[:length]
     )
     known = dict(state_names=task.state_names, control_names=task.control_names, dt=task.dt, horizon=task.horizon)
@@ -175,7 +177,7 @@ def load_episode(run: Path, trial: int) -> Episode | None:
     from pegasus_jax.types import Trajectory
 
     rows = (found[name] for name in ("x", "u", "cost"))
-    return Episode(Trajectory(*rows), str(found["ended"]))  # type: ignore[arg-type]
+    return Episode(Trajectory(*rows, memory=found.get("memory")), str(found["ended"]))  # type: ignore[arg-type]
 
 
 def origin(run: Path, trial: int) -> tuple[int, str] | None:
@@ -223,7 +225,7 @@ def _wrong(found: dict[str, np.ndarray], trial: int, task: Task) -> str | None:
 
 def save_imagined(run: Path, trial: int, imagined: Rollout, cost: Any) -> None:
     """Keep a fan of imagined trajectories for the plots."""
-    x, u, c = np.asarray(imagined.x), np.asarray(imagined.u), np.asarray(cost)
+    x, u, c = (np.asarray(rows) for rows in (imagined.x[..., : imagined.std.shape[-1]], imagined.u, cost))
     write_whole(run / "imagined" / f"{trial:04d}.npz", lambda file: np.savez(file, x=x, u=u, cost=c))
 
 

@@ -16,7 +16,7 @@ from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
 from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.math import circles
-from pegasus_jax.tasks import circled, user_code
+from pegasus_jax.tasks import circled, sensed, user_code
 from pegasus_jax.types import Cost, Task
 
 if TYPE_CHECKING:
@@ -81,7 +81,8 @@ def make(name: str, legs: int = 2) -> Task:
 def of_config(config: Config) -> Task:
     """The task that a config names."""
     own = {GYM: from_gym, MJCF: from_mjcf}
-    return own[config.task](config) if config.task in own else make(config.task, config.legs)
+    task = own[config.task](config) if config.task in own else make(config.task, config.legs)
+    return sensed.sensed(task, config.sensors)
 
 
 def rates_of(task: Task) -> tuple[int, ...]:
@@ -114,7 +115,8 @@ def input_scale(task: Task, units: tuple[float, ...]) -> Any:
     names = [name for i, name in enumerate(task.state_names) if i not in task.angles]
     if units and len(units) != len(names):
         raise ConfigError(f"policy.input_units={list(units)} must be {len(names)} numbers, of {', '.join(names)}")
-    return np.concatenate([1 / np.array(units), np.ones(2 * len(task.angles))]) if units else 1.0
+    others = len(task.memory.shown) + len(task.memory.shown_angles) + 2 * len(task.angles)
+    return np.concatenate([1 / np.array(units), np.ones(others)]) if units else 1.0
 
 
 def resolve(config: Config) -> Config:
@@ -161,7 +163,7 @@ def from_gym(config: Config) -> Task:
         environment=env_plant(name, config.env_args, len(states)),
         starts=about.starts if len(about.starts) else None,
     )
-    return circled.start_moments(circled.of_angles(task, config.circles or ()))
+    return circled.start_moments(circled.of_angles(*sensed.chosen(task, config.sensors.measured, config.circles or ())))
 
 
 def close_environments() -> None:
@@ -192,9 +194,10 @@ def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarr
     """The least and the greatest state [D] as far as its environment tells them, else infinite."""
     if config.task == GYM:
         space: Any = environment(config).observation_space
-        low, high = (circles.to_state(np.array(limit, float), task.circles) for limit in (space.low, space.high))
-        turning = [*circles.angle_places(space.shape[0], task.circles)]
-        low[turning], high[turning] = -np.inf, np.inf
+        low, high = (sensed.state_of(np.array(limit, float), task, config.sensors) for limit in (space.low, space.high))
+        rates = task.rates if config.sensors.velocity != "none" else ()
+        free = [*circles.angle_places(len(task.state_names) + len(task.circles), task.circles), *rates]
+        low[free], high[free] = -np.inf, np.inf
         return low, high
     return np.full(len(task.state_names), -np.inf), np.full(len(task.state_names), np.inf)
 
@@ -209,7 +212,7 @@ def readings(config: Config, task: Task, resets: int) -> np.ndarray:
     from pegasus_envs.gym_plant import resets_of
 
     with user_code.blamed(f"env={config.env} cannot be reset"):
-        return circles.to_state(resets_of(config.env or "", config.env_args, resets), task.circles)
+        return sensed.state_of(resets_of(config.env or "", config.env_args, resets), task, config.sensors)
 
 
 def compared(config: Config, task: Task) -> None:

@@ -1,0 +1,1 @@
+"""Measurements of what a robot needs, each with one command."""

@@ -1,0 +1,139 @@
+"""What a controller remembers of sensors that are late, or measure no rates, and what is known afterwards."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax.config import Config
+from pegasus_jax.math.angles import difference, encode
+from pegasus_jax.memory import combined, past_controls, resting
+from pegasus_jax.types import Array, Hindsight, Memory, Task
+
+WINDOW, ORDER = 5, 3  # rows of the local polynomial that tells rates afterwards, and its degree
+
+
+def remembering(config: Config, task: Task) -> Task:
+    """The task with what its controller remembers, and its states as they are known afterwards, by the settings."""
+    kept, memories = kept_by(config, task), [task.memory]
+    if kept.controls:
+        memories.append(history(task, rows=1 + kept.rows, delay=config.sensors.delay, controls=kept.controls))
+    if kept.rates:
+        memories.append(velocities(task, kept.weight))
+        task = task._replace(hindsight=Hindsight(partial(smoothed, task=task), 2 * len(task.control_names)))
+    return task._replace(memory=combined(*memories))
+
+
+class Kept(NamedTuple):
+    """What a controller keeps of an episode."""
+
+    controls: int  # the last ones
+    rows: int  # the last observations before the newest
+    rates: bool  # are computed
+    weight: float  # of the newest difference in them
+
+
+def kept_by(config: Config, task: Task) -> Kept:
+    """What the controller keeps by the settings: every control whose effect the observations do not tell yet."""
+    sensors, rows = config.sensors, config.history - 1
+    rates, weight = sensors.velocity != "none", 1.0
+    if sensors.velocity == "filter":  # a low-pass of first order
+        weight = float(1 - np.exp(-2 * np.pi * (sensors.cutoff or 0.2 / task.dt) * task.dt))
+    # A difference is the rate half a period ago: what has acted since then, one more control tells.
+    return Kept(sensors.delay + rows + rates, rows, rates, weight)
+
+
+def history(task: Task, *, rows: int, delay: int, controls: int) -> Memory:
+    """The last `rows` observations and controls, of which the newest acts `delay` periods after it was given.
+
+    The policy sees the observations before the newest, and the last `controls`. The model is given the control that
+    acts now, those of the rows before, and these rows' observations, angles as sines and cosines.
+    """
+    size, states, past_rows = len(task.control_names), len(task.state_names), rows - 1
+    shown = past_controls(task.control_names, resting(task), controls, shown=True)
+    kept = len(shown.names)
+    times = range(1, rows)
+    names = tuple(f"{name} {i} before" for i in times for name in task.state_names)
+    turning = tuple(states * i + a for i in range(past_rows) for a in task.angles)
+
+    def given(m: Array, u: Array) -> Array:
+        controls = jnp.concatenate([u, m[:kept]])[size * delay : size * (delay + rows)]
+        return jnp.concatenate([controls, encode(m[kept:], turning)]) if past_rows else controls
+
+    def advance(m: Array, o: Array, u: Array) -> Array:
+        return jnp.concatenate([shown.advance(m[:kept], o, u), *([o, m[kept:]] if past_rows else [])])[: len(m)]
+
+    return Memory(
+        names=(*shown.names, *names),
+        start=lambda key, o: jnp.concatenate([shown.start(key, o), jnp.tile(o, past_rows)]),
+        advance=advance,
+        shown=(*shown.names, *names),
+        show=lambda m, o: m,
+        shown_angles=tuple(kept + i for i in turning),
+        applied=given,
+    )
+
+
+def velocities(task: Task, weight: float) -> Memory:
+    """Rates of the task's coordinates, as a robot computes them: differences, of which the filter takes in `weight`.
+
+    With weight 1 they are the differences themselves; with less, v + weight (difference - v), a low-pass of first
+    order. The policy sees the coordinates and these rates, never rates that an observation has.
+    """
+    measured = tuple(i for i in range(len(task.state_names)) if i not in task.rates)
+    positions, n = np.array(measured), len(measured)
+    turning = tuple(place for place, i in enumerate(measured) if i in task.angles)
+    names = tuple(task.state_names[i] for i in measured)
+
+    def filtered(m: Array, o: Array) -> Array:
+        now = difference(o[positions], m[:n], turning) / task.dt
+        return now if weight == 1 else m[n:] + weight * (now - m[n:])
+
+    def advance(m: Array, o: Array, u: Array) -> Array:
+        return jnp.concatenate([o[positions], *([filtered(m, o)] if weight < 1 else [])])
+
+    return Memory(
+        names=(*(f"{name} 1 before" for name in names), *(f"filtered rate of {name}" for name in names * (weight < 1))),
+        start=lambda key, o: jnp.concatenate([o[positions], jnp.zeros(n * (weight < 1), o.dtype)]),
+        advance=advance,
+        shown=tuple(f"measured rate of {name}" for name in names),
+        show=filtered,
+        measured=measured,
+    )
+
+
+def smoothed(rows: Array, last: Array | int, controls: Array, *, task: Task) -> tuple[Array, Array]:
+    """The states [H+1, D] of an episode whose observations [H+1, D] tell positions, up to row `last`.
+
+    Rates are those of polynomials through the positions around each row, Savitzky and Golay's, after the fact: a filter
+    that runs on the robot knows only the rows before. Positions are as measured. The second value [H, 2 U] is by how
+    much more control, over a period, the rates of the rows t and t + 1 would be without error (`models.sharpened`).
+    """
+    positions = np.array([i for i in range(len(task.state_names)) if i not in task.rates])
+    turning = tuple(place for place, i in enumerate(positions) if i in task.angles)
+    weights, corners = polynomials(task.dt)
+    steps = difference(rows[1:, positions], rows[:-1, positions], turning)
+    q = jnp.concatenate([jnp.zeros_like(steps[:1]), jnp.cumsum(steps, 0)])  # no turn is lost at 180 degrees
+    u = controls[:, : len(task.control_names)]
+    turns = jnp.concatenate([jnp.zeros_like(u[:1]), u[1:] - u[:-1], jnp.zeros_like(u[:1])])  # of the control at a row
+    times = jnp.arange(len(rows))
+    first = jnp.clip(times - WINDOW // 2, 0, jnp.maximum(last - WINDOW + 1, 0))
+    around, place = first[:, None] + jnp.arange(WINDOW), jnp.clip(times - first, 0, WINDOW - 1)
+    some = (around < last)[..., None]  # a control behind the end of an episode says nothing
+    rates = jnp.einsum("tw,twn->tn", jnp.asarray(weights, q.dtype)[place], q[jnp.minimum(around, last)])
+    more = jnp.einsum("tw,twn->tn", jnp.asarray(corners, q.dtype)[place], jnp.where(some, turns[around], 0))
+    return rows.at[:, np.array(task.rates)].set(rates), jnp.concatenate([more[:-1], more[1:]], 1)
+
+
+def polynomials(dt: float) -> tuple[np.ndarray, np.ndarray]:
+    """For each place in a window of rows [WINDOW]: the weights of all its rows' positions in the rate there.
+
+    And that rate's error where the acceleration has changed by 1 at each of the rows, in periods of acceleration.
+    """
+    from scipy.signal import savgol_coeffs  # slow to import
+
+    every = range(WINDOW)
+    weights = np.stack([savgol_coeffs(WINDOW, ORDER, deriv=1, delta=dt, pos=place, use="dot") for place in every])
+    since = np.maximum(np.arange(WINDOW)[:, None] - np.arange(WINDOW), 0) * dt  # [row, row of the change]
+    return weights, (weights @ (since**2 / 2) - since) / dt

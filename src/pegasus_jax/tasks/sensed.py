@@ -1,0 +1,226 @@
+"""A task seen through the sensors that there are: some entries, late, and without rates. One function, Task -> Task."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax import memory
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.config import Sensors
+from pegasus_jax.math.circles import Circles, to_observation, to_state
+from pegasus_jax.memory import resting
+from pegasus_jax.types import Cost, Task
+
+
+def sensed(task: Task, sensors: Sensors) -> Task:
+    """The task whose state is what can be known of it: what is measured, and its rates where they are computed.
+
+    A simulation of ours gets the delay; an environment has it, and its episodes get rates. Raises ConfigError, in one
+    line, for sensors that the task cannot have.
+    """
+    if sensors.delay >= task.horizon:
+        raise ConfigError(
+            f"sensors.delay={sensors.delay} is no less than the episode, horizon={task.horizon}: no control would act;"
+            f" the nearest is {task.horizon - 1}"
+        )
+    computed = sensors.velocity != "none"
+    if task.environment is not None:
+        return with_rates(task, sensors.velocity) if computed else task
+    kept = measured = entries(task, sensors)
+    if computed:
+        rate_of = dict(zip(coordinates(task), task.rates, strict=True))
+        kept = sorted({*measured, *(rate_of[i] for i in measured)})
+    if len(kept) < len(task.state_names):
+        task = reduced(task, kept)
+    return delayed(task, sensors.delay) if sensors.delay and task.plant is not None else task
+
+
+def entries(task: Task, sensors: Sensors) -> list[int]:
+    """The entries that are measured. Raises ConfigError where they are not there, or are rates to be computed."""
+    names, measured = task.state_names, list(sensors.measured or range(len(task.state_names)))
+    for entry in measured:
+        if not 0 <= entry < len(names):
+            raise ConfigError(f"sensors.measured={entry} is not an entry; choose from 0 to {len(names) - 1}")
+    if sensors.velocity == "none":
+        return measured
+    if not task.rates:
+        raise ConfigError(
+            f"sensors.velocity={sensors.velocity} needs to know which entries are rates, and of task={task.name} it is"
+            " not known; the nearest is sensors.velocity=none history=3"
+        )
+    if rates := [entry for entry in measured if entry in task.rates]:
+        positions = coordinates(task)
+        raise ConfigError(
+            f"sensors.velocity={sensors.velocity} computes the rates of all that is measured, and {names[rates[0]]} is"
+            f" a rate itself; the nearest is sensors.measured=[{','.join(map(str, positions))}]"
+        )
+    return measured
+
+
+def coordinates(task: Task) -> list[int]:
+    """The entries that are no rates, in the order of their rates."""
+    return [i for i in range(len(task.state_names)) if i not in task.rates]
+
+
+def reduced(task: Task, kept: Sequence[int]) -> Task:
+    """The task of some of its entries; the cost and `stop` still get all of them, the others as 0.
+
+    Raises ConfigError where the cost depends on one of those.
+    """
+    states, kept = len(task.state_names), list(kept)
+    place, plant, stop = np.array(kept), task.plant, task.stop
+    _blind(task, [i for i in range(states) if i not in kept])
+
+    def whole(x: jax.Array) -> jax.Array:
+        return jnp.zeros(states, x.dtype).at[place].set(x)
+
+    return task._replace(
+        plant=plant._replace(observe=lambda state: plant.observe(state)[place]),
+        cost=_of(task.cost, whole, place),
+        stop=None if stop is None else lambda x: stop(whole(x)),
+        **_picked(task, kept),
+    )
+
+
+def _of(cost: Cost, whole: Any, place: np.ndarray) -> Cost:
+    """The cost of some of the entries of a state, the others being 0."""
+    expected, widen = cost.expected, cost.widen
+
+    def moments(mean: jax.Array, cov: jax.Array) -> jax.Array:
+        assert expected is not None
+        all_of = whole(mean)
+        wide = jnp.zeros((all_of.size, all_of.size), cov.dtype).at[place[:, None], place].set(cov)
+        return expected(all_of, wide)
+
+    return Cost(
+        lambda x: cost.of_state(whole(x)),
+        None if expected is None else moments,
+        None if widen is None else lambda factor: _of(widen(factor), whole, place),
+    )
+
+
+def _blind(task: Task, missing: Sequence[int]) -> None:
+    """Raises ConfigError where the cost of some states changes with an entry that is missing."""
+    draw = np.random.default_rng(0)
+    mean, std = np.asarray(task.start_mean, float), np.asarray(task.start_std, float) + 1.0
+    states = jnp.asarray(mean + std * draw.normal(size=(32, len(mean))))
+    slopes = jax.vmap(jax.grad(lambda x: task.cost.of_state(x).astype(float)))(states)
+    for entry in missing:
+        if np.any(np.asarray(slopes)[:, entry] != 0):
+            raise ConfigError(
+                f"the cost depends on {task.state_names[entry]}, entry {entry}, which is not measured; measure it, or"
+                " give a cost of what is"
+            )
+
+
+def delayed(task: Task, delay: int) -> Task:
+    """The task whose plant gets a control `delay` periods after it was given; until then it is at rest."""
+    plant, rest = task.plant, resting(task)
+
+    def step(state: tuple[Any, jax.Array], u: jax.Array) -> tuple[Any, jax.Array]:
+        inner, waiting = state
+        return plant.step(inner, waiting[0]), jnp.concatenate([waiting[1:], u[None]])
+
+    late = plant._replace(
+        reset=lambda key: (plant.reset(key), jnp.tile(jnp.asarray(rest, float), (delay, 1))),
+        step=step,
+        observe=lambda state: plant.observe(state[0]),
+    )
+    films = (
+        {"substates": lambda state, u: plant.substates(state[0], state[1][0])} if "substates" in plant._fields else {}
+    )
+    return task._replace(plant=late._replace(**films))
+
+
+def chosen(task: Task, measured: Sequence[int], circles: Circles) -> tuple[Task, Circles]:
+    """The task of an environment of which these entries are measured, all of them where none is named; and circles.
+
+    What its user wrote is of these entries, in this order. Raises ConfigError where they are not there.
+    """
+    if not measured:
+        return task, circles
+    keep = entries(task, Sensors(measured=tuple(measured)))
+    place, environment = np.array(keep), task.environment
+
+    def step(control: np.ndarray) -> tuple[Any, ...]:
+        x, *rest = environment.step(control)
+        return x[place], *rest
+
+    task = task._replace(
+        environment=environment._replace(reset=lambda seed: environment.reset(seed)[place], step=step),
+        starts=None if task.starts is None else np.asarray(task.starts)[:, place],
+        **_picked(task, keep),
+    )
+    return task, tuple((keep.index(i), keep.index(j)) for i, j in circles if {i, j} <= {*keep})
+
+
+def state(x: Any, task: Task) -> Any:
+    """The state [..., D] of an observation [..., O] as a controller is given it; what that does not tell is 0."""
+    x, places = to_state(x, task.circles), memory.measured(task)
+    size = len(task.state_names)
+    return x if len(places) == size else jnp.zeros((*x.shape[:-1], size), x.dtype).at[..., np.array(places)].set(x)
+
+
+def observation(x: Any, task: Task) -> Any:
+    """What a controller is given [..., O] where the state is x [..., D]."""
+    places = memory.measured(task)
+    return to_observation(x if len(places) == len(task.state_names) else x[..., np.array(places)], task.circles)
+
+
+def state_of(rows: np.ndarray, task: Task, sensors: Sensors) -> np.ndarray:
+    """States [..., D] at rest of what an environment observes [..., O]."""
+    x = to_state(rows[..., list(sensors.measured)] if sensors.measured else rows, task.circles)
+    more = np.zeros((*x.shape[:-1], len(task.state_names) - x.shape[-1]), x.dtype)
+    return np.concatenate([x, more], -1)
+
+
+def _picked(task: Task, kept: Sequence[int]) -> dict[str, Any]:
+    """What is known of these entries of a task's state."""
+    kept, place = list(kept), np.array(kept)
+    return dict(
+        angles=tuple(kept.index(i) for i in task.angles if i in kept),
+        rates=tuple(kept.index(i) for i in task.rates if i in kept),
+        state_names=tuple(task.state_names[i] for i in kept),
+        **{name: np.asarray(getattr(task, name))[place] for name in ("start_mean", "start_std", "sensor_std")},
+    )
+
+
+def with_rates(task: Task, velocity: str) -> Task:
+    """The task of an environment that measures positions [n], its state [2 n] them and their rates behind them.
+
+    The rates of an episode's rows are differences from the row before; those of the first row are 0. Raises ConfigError
+    where an entry is a rate already.
+    """
+    if task.rates:
+        raise ConfigError(
+            f"sensors.velocity={velocity} computes the rates of all that is measured, and"
+            f" {task.state_names[task.rates[0]]} is a rate itself; the nearest is"
+            f" rates=[] sensors.measured=[{','.join(map(str, coordinates(task)))}]"
+        )
+    n, environment, dt = len(task.state_names), task.environment, task.dt
+    turning, before = list(task.angles), np.zeros(0)
+
+    def state(q: np.ndarray, new: bool) -> np.ndarray:
+        nonlocal before
+        change = np.zeros_like(q) if new else q - before
+        change[turning] = np.arctan2(np.sin(change[turning]), np.cos(change[turning]))
+        before = q
+        return np.concatenate([q, change / dt]).astype(q.dtype)
+
+    def step(control: np.ndarray) -> tuple[Any, ...]:
+        q, *rest = environment.step(control)
+        return state(q, False), *rest
+
+    def grown(rows: Any) -> np.ndarray:
+        return np.concatenate([np.asarray(rows, float), np.zeros(np.shape(rows))], -1)
+
+    return task._replace(
+        environment=environment._replace(reset=lambda seed: state(environment.reset(seed), True), step=step),
+        rates=tuple(range(n, 2 * n)),
+        state_names=(*task.state_names, *(f"rate of {name}" for name in task.state_names)),
+        starts=None if task.starts is None else grown(task.starts),
+        **{name: grown(getattr(task, name)) for name in ("start_mean", "start_std", "sensor_std")},
+    )

@@ -1,0 +1,264 @@
+"""Sensors that are late, or measure no rates: imagination, the plant, the data and a file all have the same ones."""
+
+import json
+from functools import partial
+
+import gymnasium
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.signal import savgol_filter
+
+import folders
+from pegasus_jax import memory, tasks
+from pegasus_jax.assembly.experiments import blind, compose
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.config import Sensors
+from pegasus_jax.episode import run
+from pegasus_jax.exports import as_c, write
+from pegasus_jax.imagine import matching
+from pegasus_jax.imagine.rollout import rollout
+from pegasus_jax.models.sharpened import sharpened
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.controller import controller
+from pegasus_jax.tasks.remembered import polynomials, remembering, smoothed
+from pegasus_jax.tasks.sensed import sensed
+from pegasus_jax.types import Batch, Dataset, Dynamics, Prediction, Scenarios
+from probes import cart, linear_policy, tiny
+
+H, DT = 8, 0.3
+A, B = np.array([[1, DT], [0, 1]]), np.array([DT**2 / 2, DT])  # the probe's cart
+KINDS = {
+    "late": dict(sensors=Sensors(delay=2)),
+    "difference": dict(sensors=Sensors(measured=(0,), velocity="difference")),
+    "late filter": dict(sensors=Sensors(measured=(0,), velocity="filter", delay=1)),
+    "history": dict(sensors=Sensors(measured=(0,), delay=1), history=3),
+}
+
+
+def sensing(name):
+    """(config, the cart's task through these sensors, what it remembers included)."""
+    config = tiny(**KINDS[name])
+    task = cart(H)._replace(sensor_std=np.zeros(2))
+    task = task if name != "history" else task._replace(cost=task.cost._replace(of_state=lambda x: x[0] ** 2))
+    return config, blind(remembering(config, sensed(task, config.sensors)))
+
+
+def exact(task):
+    """The cart as a model; of a history it is what two positions and the controls between tell of a third."""
+
+    def apply(posterior, draw, x, u):
+        # q + dq = 2 q - q' + dt^2 (u + u') / 2; given are u, u', u'' and q', q''
+        history = lambda: x - u[3:4] + DT**2 / 2 * (u[0] + u[1])  # noqa: E731
+        change = (A - np.eye(2)) @ x + B * u[0] if len(x) == 2 else history()
+        return Prediction(change, jnp.zeros_like(x))
+
+    return Dynamics(None, None, None, None, None, apply)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_imagined_with_the_true_model_is_what_the_plant_does(name):
+    """Without noise every state, control and memory of both is the same, whatever the sensors are.
+
+    Of a history from the row on at which it tells the rate.
+    """
+    _, task = sensing(name)
+    policy = linear_policy(len(memory.seen_names(task)), 1)._replace(memory=task.memory)
+    gain = 0.5 * jax.random.normal(jax.random.key(4), (1, len(memory.seen_names(task)))) - 0.3
+    ran = run(jax.random.key(0), lambda key, t, seen: policy.apply(gain, None, seen), task)
+    whole = memory.join(ran.x, memory.replay(task.memory, ran))
+    first = 3 if name == "history" else 0
+    draws = [jnp.zeros((H - first, 1, size)) for size in (ran.x.shape[1], whole.shape[1])]
+    given = Scenarios(whole[first : first + 1], jnp.zeros(1), jnp.zeros(1), *draws)
+    rolled = rollout(gain, None, given, dynamics=exact(task), policy=policy, match=matching.keep)
+    np.testing.assert_allclose(rolled.u[:, 0], ran.u[first:], rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(rolled.x[:, 0], whole[first:], rtol=1e-3, atol=1e-3)
+    assert ran.u.std() > 0.05
+
+
+def test_a_late_plant_is_the_plant_of_the_controls_before():
+    plain = cart(H)._replace(sensor_std=np.zeros(2))
+    late = sensed(plain, Sensors(delay=2))
+    u = np.random.default_rng(0).uniform(-2, 2, (H, 1)).astype(np.float32)
+    moved = [
+        run(jax.random.key(0), lambda key, t, x, c=c: jnp.asarray(c)[t], task).x
+        for task, c in ((late, u), (plain, np.concatenate([np.zeros((2, 1), np.float32), u[:-2]])))
+    ]
+    np.testing.assert_array_equal(*moved)
+
+
+@pytest.mark.parametrize("length", [3, 4, 5, 9, 14])
+def test_rates_afterwards_are_those_of_scipy(length):
+    """Whatever rows lie behind the end, and whatever turns the angle makes."""
+    rows = 15
+    task = cart(rows - 1)._replace(angles=(0,), dt=0.1)
+    q = np.cumsum(np.random.default_rng(0).normal(1.5, 1, rows))
+    seen = np.stack([np.angle(np.exp(1j * q)), np.full(rows, np.nan)], 1)
+    seen[length + 1 :] = 99
+    x, more = jax.jit(partial(smoothed, task=task))(jnp.asarray(seen), length, jnp.zeros((rows - 1, 1)))
+    assert more.shape == (rows - 1, 2)
+    if length >= 4:
+        truth = savgol_filter(q[: length + 1], 5, 3, deriv=1, delta=0.1)
+        np.testing.assert_allclose(x[: length + 1, 1], truth, rtol=1e-3, atol=1e-3)
+    np.testing.assert_array_equal(x[: length + 1, 0], seen[: length + 1, 0].astype(np.float32))
+    assert np.isfinite(x[: length + 1]).all()
+
+
+def driven(seed=0, rows=12):
+    """Positions, rates and controls of the probe's cart under controls that jump."""
+    draw = np.random.default_rng(seed)
+    x, u = [draw.normal(size=2)], draw.uniform(-2, 2, rows)
+    for control in u:
+        x.append(A @ x[-1] + B * control)
+    return np.array(x), u[:, None]
+
+
+def test_the_error_of_these_rates_is_known(x64):
+    """Of a mass under held forces exactly: the control that would make up for it, times what a period of it does."""
+    x, u = driven()
+    task = cart(12)
+    found, more = smoothed(jnp.asarray(x), 12, jnp.asarray(u), task=task)
+    error = np.asarray(found[:, 1]) - x[:, 1]
+    assert np.abs(error).max() > 0.05
+    np.testing.assert_allclose(error[:-1], DT * more[:, 0], atol=1e-9)
+    np.testing.assert_allclose(error[1:], DT * more[:, 1], atol=1e-9)
+    weights, corners = polynomials(DT)
+    np.testing.assert_allclose(weights.sum(1), 0, atol=1e-9)
+    np.testing.assert_allclose(corners[:, [0, -1]], 0, atol=1e-9)  # at a window's ends nothing changes in it
+
+
+def test_a_fit_sees_the_rates_that_there_were(x64):
+    """The loss of the true model on the filtered rates is its loss on the true ones."""
+    x, u = driven()
+    seen, more = smoothed(jnp.asarray(x), 12, jnp.asarray(u), task=cart(12))
+
+    def loss(params, key, batch, context):
+        return jnp.sum((batch.y - batch.x @ (A - np.eye(2)).T - batch.u[:, :1] * B) ** 2)
+
+    model = exact(None)._replace(
+        prepare=lambda data: data.u.shape[1],
+        loss=loss,
+        posterior=lambda params, data: None,
+        sample=lambda key, posterior: jnp.zeros(()),
+    )
+    both = jnp.concatenate([jnp.asarray(u), more], 1)
+    data = Dataset(seen[:-1], both, seen[1:] - seen[:-1], jnp.int32(12))
+    fitted = sharpened(model, rates=(1,), controls=1, inputs=1)
+    context = fitted.prepare(data)
+    assert context[0] == 1
+    assert fitted.loss(None, jax.random.key(0), Batch(*data[:3]), context) < 1e-12
+    assert model.loss(None, None, Batch(data.x, data.u[:, :1], data.y), None) > 0.01
+
+
+SETTINGS = {
+    "difference": "sensors.measured=[0,3] sensors.velocity=difference sensors.delay=1",
+    "filter": "sensors.measured=[0,3] sensors.velocity=filter sensors.cutoff=1.5 x64=true",
+    "history": "sensors.measured=[0,3] history=3 sensors.delay=1 model=log_normal",
+    "late": "sensors.delay=2",
+}
+
+
+@pytest.fixture(scope="module", params=SETTINGS)
+def sensor_run(request, tmp_path_factory):
+    """A run whose controller remembers."""
+    words = dict(word.split("=", 1) for word in SETTINGS[request.param].split())
+    config = config_io.parse({"task": "cartpole", **words})
+    task = sensed(tasks.make("cartpole"), config.sensors)
+    changes = {key.replace(".", "__"): value for key, value in words.items()} | {"search__particles": "16"}
+    return request.param, folders.a_run(tmp_path_factory.mktemp("run") / "run", made=task, **changes)
+
+
+def test_a_file_remembers_as_the_controller_does(sensor_run):
+    """Written, compared on 1,000 observations in episodes of 20, and kept; its contract says what it remembers."""
+    name, run_of = sensor_run
+    for format in ("numpy", *(["c"] if any(map(as_c.shutil.which, as_c.COMPILERS)) else [])):
+        said = json.loads(write.contract_of(write.export(run_of, 2, format)).read_text())
+        assert said["parity"]["largest_difference"] <= said["parity"]["allowed"]
+        assert len(said["observation"]) == (4 if name == "late" else 2)
+        assert said["history"]["controls"] == {"difference": 2, "filter": 1, "history": 3, "late": 2}[name]
+        assert (said["filter"] != "none") == (name in ("difference", "filter"))
+    with pytest.raises(ConfigError, match=r"format=onnx cannot write a controller that remembers .* format=numpy"):
+        write.export(run_of, 2, "onnx")
+
+
+def test_a_reset_forgets_the_episode(sensor_run):
+    name, run_of = sensor_run
+    control = controller(run_of, 2)
+    first, second = np.full(4 if name == "late" else 2, 0.1), np.full(4 if name == "late" else 2, 0.4)
+    fresh = control(second)
+    control.reset()
+    control(first)
+    assert not np.allclose(control(second), fresh, rtol=1e-6)
+    control.reset()
+    np.testing.assert_array_equal(control(second), fresh)
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        ("sensors.measured=[0,1] sensors.velocity=difference", "x' [m/s] is a rate itself; the nearest is sensors.mea"),
+        ("sensors.measured=[9]", "sensors.measured=9 is not an entry; choose from 0 to 3"),
+        ("sensors.measured=[0,1]", "the cost depends on theta [rad], entry 3, which is not measured"),
+        ("sensors.delay=25", "sensors.delay=25 is no less than the episode, horizon=25"),
+        ("sensors.velocity=diff", "sensors.velocity=diff is not a choice; did you mean 'difference'?"),
+        ("sensors.cutoff=3", "sensors.cutoff=3 is of no use with sensors.velocity=none"),
+        ("history=2 sensors.velocity=filter", "both stand for rates; the nearest is history=1"),
+        ("history=0", "history=0 is out of range"),
+    ],
+)
+def test_sensors_that_cannot_be_are_one_line(words, part):
+    with pytest.raises(ConfigError) as refused:
+        tasks.of_config(config_io.parse({"task": "cartpole", **dict(word.split("=", 1) for word in words.split())}))
+    assert part in str(refused.value)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+class Slide(gymnasium.Env):
+    """The probe's cart, of which the position is observed, behind an entry that is of no use."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+    action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,))
+    dt = DT
+
+    def reset(self, *, seed=None, options=None):
+        self.x = np.array([1.0, 0.0]) + np.random.default_rng(seed).normal(0, 0.1, 2)
+        return np.array([7.0, self.x[0]]), {}
+
+    def step(self, control):
+        self.x = A @ self.x + B * control[0]
+        return np.array([7.0, self.x[0]]), 0.0, False, False, {}
+
+
+gymnasium.register("Slide-v0", Slide)
+
+
+def squared(x):
+    """Of what is measured, and its rate."""
+    assert x.shape == (2,)
+    return 1 - jnp.exp(-(x[0] ** 2) - 0.1 * x[1] ** 2)
+
+
+def test_an_environment_gets_rates_as_a_robot_computes_them():
+    words = "sensors.measured=[1] sensors.velocity=difference sensors.delay=1 horizon=8 start_mean=[7,1]"
+    config = config_io.parse(
+        {"task": "gym", "env": "Slide-v0", "cost": squared} | dict(word.split("=", 1) for word in words.split())
+    )
+    task = tasks.of_config(tasks.resolve(config))
+    assert (task.state_names, task.rates) == (("x1", "rate of x1"), (1,))
+    np.testing.assert_array_equal(task.start_mean, [1, 0])
+    config = tiny(sensors=config.sensors, search__steps=2, search__cost_width_start=1.0, fit__steps=2, trials=2)
+    exp = compose(config, task)
+    state = exp.init(jax.random.key(0))
+    ran = exp.collect(state)
+    x, u = np.asarray(ran.x), np.asarray(ran.u)
+    np.testing.assert_allclose(x[1:, 1], np.diff(x[:, 0]) / DT, rtol=1e-4)
+    assert x[0, 1] == 0
+    added = exp.add_episode(state, ran)
+    np.testing.assert_allclose(added.data.u[:8, 0], [0, *u[:-1, 0]])  # aligned: the control that acted
+    state, _ = exp.improve(added)
+    later = exp.collect(state)
+    see = jax.vmap(memory.steps(exp.task.memory)[0])
+    seen = see(memory.replay(exp.task.memory, later)[:-1], later.x[:-1])
+    np.testing.assert_allclose(seen[:, 0], later.x[:-1, 0])
+    np.testing.assert_allclose(seen[:, -1], later.x[:-1, 1], rtol=1e-3, atol=1e-4)  # as the rows' own differences
