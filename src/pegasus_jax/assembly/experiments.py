@@ -48,7 +48,8 @@ def compose(
     dynamics = dynamics or dynamics_of(config.model, task)
     visits = bool(config.search.visited_starts) and searcher is None
     dynamics = visited.remembering(dynamics) if visits else dynamics
-    policy = (policy or policy_of(config.policy, task))._replace(memory=task.memory)
+    policy = policy or policy_of(config.policy, task)
+    policy = policy._replace(memory=task.memory) if task.memory.names else policy
     searching = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     low, high = limits(task)
     explore = config.explore
