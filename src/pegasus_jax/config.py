@@ -305,7 +305,17 @@ class Config:
     legs: int = setting(2, "that the swimmer drives: 2 or 6", ("swimmer_*",))
     env: str | None = setting(None, "the environment's Gymnasium id", (GYM,))
     mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", (MJCF,))
-    cost: str | Callable | None = setting(None, "module:function, observation [D] -> cost in [0, 1], in JAX", OWN)  # noqa: RUF009 (frozen)
+    cost: str | Callable | None = setting(  # noqa: RUF009 (frozen)
+        None,
+        "module:function in JAX, (observation [D], maybe u, previous_u, t, reference, goal) -> cost in [0, 1]",
+        EVERY,
+    )
+    reference: str | Callable | None = setting(  # noqa: RUF009 (frozen)
+        None, "what the cost's reference is: a file .csv or .npz, or module:function of the time [s], in JAX", EVERY
+    )
+    goal_low: tuple[float, ...] = setting((), "least goals of episodes, drawn uniformly; [] where none are", EVERY)
+    goal_high: tuple[float, ...] = setting((), "greatest goals", EVERY)
+    goals: str | Callable | None = setting(None, "module:function that draws an episode's goal from a key, in JAX", EVERY)  # noqa: RUF009 (frozen)
     angles: tuple[int, ...] = setting((), "the entries of the observation that are angles [rad]", OWN)
     rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", (GYM,))
     circles: tuple[tuple[int, ...], ...] | None = setting(
@@ -332,7 +342,7 @@ class Config:
         (0.1,), "spread of the starts around start_mean, one for all or one each", OWN
     )
     starts: tuple[tuple[float, ...], ...] = setting(
-        (), "observations where episodes start, equally likely; []: 100 resets, or as start_mean says", (GYM,)
+        (), "observations where episodes start, equally likely; []: 100 resets, or as start_mean says", EVERY
     )
     success: float = setting(0.2, "the mean cost of an episode's last five steps is less than this", OWN)
 
@@ -343,7 +353,7 @@ class Config:
         checks.check_range("stop_cost", self.stop_cost, 0)
         for name in ("env_args", "angles", "rates", "observe"):
             checks.different(name, getattr(self, name))
-        for name in ("control_low", "control_high", "start_mean"):
+        for name in ("control_low", "control_high", "start_mean", "goal_low", "goal_high"):
             checks.finite(name, getattr(self, name))
         for row in self.starts:
             checks.finite("starts", row)

@@ -86,6 +86,7 @@ def combined(*memories: Memory) -> Memory:
         shown=tuple(name for memory in memories for name in memory.shown),
         show=lambda m, o: each(lambda i, memory: memory.show(part(m, i), o)),
         shown_angles=tuple(int(shown[i]) + a for i, memory in enumerate(memories) for a in memory.shown_angles),
+        shown_units=tuple(unit for memory in memories for unit in units(memory)),
         applied=applied if applying else None,
         matched=all(memory.matched for memory in memories),
         measured=measuring[0] if measuring else None,
@@ -135,6 +136,11 @@ def given_size(memory: Memory, controls: int) -> int:
 def measured(task: Task) -> tuple[int, ...]:
     """The entries of the state that an observation tells; of the others it has something that nobody looks at."""
     return tuple(range(len(task.state_names))) if task.memory.measured is None else task.memory.measured
+
+
+def units(memory: Memory) -> tuple[float, ...]:
+    """How large each of what the policy is shown is."""
+    return memory.shown_units or (1.0,) * len(memory.shown)
 
 
 def seen_names(task: Task) -> tuple[str, ...]:

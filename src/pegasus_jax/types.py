@@ -120,6 +120,7 @@ class Memory(NamedTuple):
     shown: tuple[str, ...] = ()  # names of what the policy sees beside o; it sees P = O + len(shown) entries
     show: Callable[[Any, Array], Array] = lambda m, o: o[:0]  # (m, o) -> these entries
     shown_angles: tuple[int, ...] = ()  # which of these are angles [rad]
+    shown_units: tuple[float, ...] = ()  # how large each of these is, as a network counts it; (): 1
     # (m, u [U]) -> what the model is given in place of the control u [V], such as one of some periods ago; None: u
     applied: Callable[[Any, Array], Array] | None = None
     # Whether m may be redrawn with x from their common Gaussian. Not what an episode keeps, and x depends on: a goal.
@@ -150,6 +151,13 @@ class Policy(NamedTuple):
     # (fresh params, data) -> params that take the data's large entries in their own units; None: not needed
     adapt: Callable[[Params, Dataset], Params] | None = None
     memory: Memory = NO_MEMORY  # what it sees beside the observation, if it is more: x [D] above is then [P]
+
+
+class Signal(NamedTuple):
+    """What is asked of a policy from outside: a reference, which changes with time, or the goal of an episode."""
+
+    value: Callable[[Array], Array]  # a reference: t [] [s] -> [R]; a goal: key -> [G]
+    units: tuple[float, ...]  # how large each of its entries is: a network counts it in these
 
 
 class Cost(NamedTuple):
@@ -192,8 +200,13 @@ class Task(NamedTuple):
     # observation is x.
     circles: tuple[tuple[int, ...], ...] = ()
     starts: Any = None  # [N, D] states where episodes start, equally likely; None: N(start_mean, diag(start_std^2))
+    starts_std: Any = None  # [D] spread of the starts around these, normal; None: they are used as they are
     memory: Memory = NO_MEMORY
     hindsight: Hindsight | None = None  # None: the states are as observed
+    # Which of u, previous_u, t, reference, goal the cost takes; None: `cost` and `stop` are of x yet, not of x'
+    terms: tuple[str, ...] | None = None
+    reference: Signal | None = None
+    goal: Signal | None = None
 
     @property
     def may_end(self) -> bool:

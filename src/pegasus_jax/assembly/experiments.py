@@ -13,7 +13,6 @@ from pegasus_jax.assembly.searchers import limits, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.imagine import visited
-from pegasus_jax.imagine.costs import blind_to_memory
 from pegasus_jax.sharding import over_particles
 from pegasus_jax.tasks.remembered import remembering
 from pegasus_jax.types import Array, Cost, Dynamics, ModelLearner, Policy, PolicyOptimizer, Task
@@ -40,15 +39,13 @@ def compose(
 ) -> Experiment:
     """The experiment of a config on any task, with pieces of your own in place of the configured or the task's ones.
 
-    A `cost` may be a function of one state x [D]. A `searcher` improves the policy for `config.search.steps` steps;
+    A `cost` may be a function of one state x [D] and, by these names, of u, previous_u, t, reference, goal. A
+    `searcher` improves the policy for `config.search.steps` steps;
     what is imagined after a search is as configured.
     With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
     does not suit the config: a cost without a width, for example, needs `search.cost_width_start=1`.
     """
-    task = task._replace(cost=as_cost(task.cost if cost is None else cost))
-    task = remembering(config, task)
-    if task.memory.names:
-        task = blind(task)
+    task = tasks.whole(remembering(config, task), None if cost is None else as_cost(cost))
     dynamics = dynamics or dynamics_of(config.model, task)
     if config.search.visited_starts and searcher is None:
         dynamics = visited.remembering(dynamics)
@@ -69,14 +66,6 @@ def compose(
         explore_trials=explore.trials,
         compare=config.successor == "better",
         capacity=config.trials * task.horizon,
-    )
-
-
-def blind(task: Task) -> Task:
-    """The task with its cost and its `stop`, which are of x [D], as functions of x' [D + M]."""
-    states, stop = len(task.state_names), task.stop
-    return task._replace(
-        cost=blind_to_memory(task.cost, states), stop=None if stop is None else lambda x: stop(x[:states])
     )
 
 

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import optax
 
@@ -23,6 +22,7 @@ from pegasus_jax.memory import begin, steps
 from pegasus_jax.pilco import search as pilco
 from pegasus_jax.policies.scaled import inherited
 from pegasus_jax.sharding import Spread, together
+from pegasus_jax.tasks.starts import start
 from pegasus_jax.types import (
     Array,
     Cost,
@@ -250,14 +250,6 @@ def imagined(
     """Rollouts under fresh scenarios and the cost of every particle [H, K]."""
     rolled = rollout(params, posterior, scenarios.draw(key, 0, posterior, blocks=blocks, period=Period()), **pieces)
     return rolled, until_stop(task, cost.of_particles(task.cost))(rolled.x[1:])
-
-
-def start(key: Key, *, task: Task) -> Array:
-    """A first state [D] of the task."""
-    if task.starts is not None:
-        return jax.random.choice(key, jnp.asarray(task.starts, float))
-    mean, std = jnp.asarray(task.start_mean, float), jnp.asarray(task.start_std, float)
-    return mean + std * jax.random.normal(key, mean.shape)
 
 
 def first_seen(key: Key, *, task: Task) -> Array:

@@ -1,7 +1,7 @@
 """Costs of states, and what a search makes of the costs of K imagined rollouts."""
 
 from collections.abc import Callable
-from functools import lru_cache
+from functools import lru_cache, wraps
 
 import jax
 import jax.numpy as jnp
@@ -71,7 +71,7 @@ def blind_to_memory(cost: Cost, states: int) -> Cost:
     """The cost of x' [D + M], what is remembered beside x, whose first D entries a cost of x [D] is of."""
     expected, widen = cost.expected, cost.widen
     return Cost(
-        lambda x: cost.of_state(x[:states]),
+        wraps(cost.of_state)(lambda x: cost.of_state(x[:states])),
         None if expected is None else lambda mean, cov: expected(mean[:states], cov[:states, :states]),
         None if widen is None else lambda factor: blind_to_memory(widen(factor), states),
     )

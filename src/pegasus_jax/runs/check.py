@@ -36,7 +36,7 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
         task.success,
         task.circles,
     )
-    notes = cost_check.notes(task.cost.of_state, facts, f"cost={shown(config.cost)}")
+    notes = cost_check.notes(task.cost.of_state, cost_check.beside(facts, task), f"cost={shown(config.cost)}")
     stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)

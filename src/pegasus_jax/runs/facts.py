@@ -5,6 +5,7 @@ They lie in a run's folder, so that whoever looks at the run needs neither a rob
 
 from __future__ import annotations
 
+import inspect
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -35,8 +36,25 @@ def of_task(task: Task) -> dict[str, Any]:
         **{name: np.asarray(getattr(task, name), float).tolist() for name in (*STATE, *CONTROL)},
         **{name: float(getattr(task, name)) for name in NUMBERS},
         **({"circles": [list(pair) for pair in task.circles]} if task.circles else {}),
+        **asked(task),
         **({} if digest is None else {"mjcf_digest": digest}),
     }
+
+
+def asked(task: Task) -> dict[str, Any]:
+    """What a cost takes beside the state: names, a reference as its values along an episode, the sizes of goals."""
+    if not task.terms:
+        return {}
+    import jax
+
+    from pegasus_jax.tasks.signals import times
+
+    told: dict[str, Any] = {"terms": list(task.terms)}
+    if task.reference is not None:
+        told["reference"] = np.asarray(jax.vmap(task.reference.value)(times(task)), float).tolist()
+    if task.goal is not None:
+        told["goal"] = list(task.goal.units)
+    return told
 
 
 def to_task(found: Any, where: str) -> Task:
@@ -58,7 +76,38 @@ def to_task(found: Any, where: str) -> Task:
     from pegasus_jax.types import Cost, Task
 
     cost = Cost(unknown_cost, unknown_cost, lambda factor: cost)  # as wide as may be asked: it is never computed
-    return Task(plant=None, cost=cost, **known)
+    task = Task(plant=None, cost=cost, **known)
+    return _asking(task, found, where) if "terms" in found else task
+
+
+def _asking(task: Task, found: Any, where: str) -> Task:
+    """The task of the facts that `asked` has written; its goals are all 0."""
+    import jax.numpy as jnp
+
+    from pegasus_jax.tasks.signals import of_times, table, times
+    from pegasus_jax.tasks.terms import TERMS
+    from pegasus_jax.types import Cost, Signal
+
+    try:
+        terms = [_text(term) for term in found["terms"]]
+        if not {*terms} <= {*TERMS}:
+            raise TypeError("terms")
+        if "reference" in found:
+            along = times(task)
+            rows = np.array([_numbers(row, len(found["reference"][0])) for row in found["reference"]])
+            task = task._replace(reference=of_times(table(along, rows[: len(along)]), along))
+        if "goal" in found:
+            units = tuple(_numbers(found["goal"], len(found["goal"])).tolist())
+            task = task._replace(goal=Signal(lambda key: jnp.zeros(len(units)), units))
+    except (KeyError, IndexError, TypeError, ValueError) as error:
+        raise RunError(f"{where} is damaged: its task has no usable {str(error) or 'facts'}") from error
+
+    def unknown(*_: Any, **__: Any) -> Any:
+        unknown_cost()
+
+    words = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in ("x", *terms)]
+    unknown.__signature__ = inspect.Signature(words)  # type: ignore[attr-defined]
+    return task._replace(cost=Cost(unknown))
 
 
 def unknown_cost(*_: Any) -> Any:

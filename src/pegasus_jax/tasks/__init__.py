@@ -11,18 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pegasus_jax import interrupt
+from pegasus_jax import interrupt, memory
 from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
 from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.math import circles
-from pegasus_jax.tasks import circled, sensed, user_code
+from pegasus_jax.tasks import circled, sensed, terms, user_code
+from pegasus_jax.tasks.signals import FILES, named, with_signals
+from pegasus_jax.tasks.starts import from_starts
+from pegasus_jax.tasks.terms import whole
 from pegasus_jax.types import Cost, Task
 
 if TYPE_CHECKING:
     from pegasus_envs.plant import Plant
 
-__all__ = ["make", "of_config"]
+__all__ = ["make", "of_config", "whole"]
 
 
 def of_plant(name: str, plant: "Plant") -> Task:
@@ -82,7 +85,11 @@ def of_config(config: Config) -> Task:
     """The task that a config names."""
     own = {GYM: from_gym, MJCF: from_mjcf}
     task = own[config.task](config) if config.task in own else make(config.task, config.legs)
-    return sensed.sensed(task, config.sensors)
+    if config.cost is not None and config.task not in own:
+        task = task._replace(cost=Cost(user_code.load("cost", config.cost)))
+    if config.starts and task.environment is None:
+        task = from_starts(task, config.starts)
+    return with_signals(sensed.sensed(task, config.sensors), config)
 
 
 def rates_of(task: Task) -> tuple[int, ...]:
@@ -115,8 +122,10 @@ def input_scale(task: Task, units: tuple[float, ...]) -> Any:
     names = [name for i, name in enumerate(task.state_names) if i not in task.angles]
     if units and len(units) != len(names):
         raise ConfigError(f"policy.input_units={list(units)} must be {len(names)} numbers, of {', '.join(names)}")
-    others = len(task.memory.shown) + len(task.memory.shown_angles) + 2 * len(task.angles)
-    return np.concatenate([1 / np.array(units), np.ones(others)]) if units else 1.0
+    shown = [unit for i, unit in enumerate(memory.units(task.memory)) if i not in task.memory.shown_angles]
+    turning = 2 * (len(task.angles) + len(task.memory.shown_angles))
+    every = np.concatenate([1 / np.array([*(units or np.ones(len(names))), *shown]), np.ones(turning)])
+    return every if units or any(unit != 1 for unit in shown) else 1.0
 
 
 def resolve(config: Config) -> Config:
@@ -125,6 +134,8 @@ def resolve(config: Config) -> Config:
     That of a Gymnasium environment says all that has to be known of it, so that whoever reads the folder, or goes on
     with it, neither opens nor resets it: it may be a robot.
     """
+    if isinstance(config.reference, str) and config.reference.endswith(FILES):
+        config = dataclasses.replace(config, reference=os.path.abspath(config.reference))
     if config.task == GYM:
         from pegasus_envs.gym_plant import EnvSpec, env_spec
 
@@ -184,7 +195,7 @@ def _complete(config: Config) -> None:
     """Raises ConfigError unless an environment is named, and a cost that there is: no robot is opened for nothing."""
     if config.env is None or config.cost is None:
         raise ConfigError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
-    user_code.load("cost", config.cost)
+    terms.agree(user_code.load("cost", config.cost), *named(config))
     module, colon, _ = config.env.partition(":")
     if colon:  # Gymnasium imports it, to register what is in it
         user_code.importing(f"env={config.env}", module)

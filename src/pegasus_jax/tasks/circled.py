@@ -24,7 +24,7 @@ def of_angles(task: Task, circles: pairs.Circles) -> Task:
     angles = (*pairs.places(task.angles, size, circles), *pairs.angle_places(size, circles))
 
     def of_observation(function: Callable[..., Any]) -> Callable[..., Any]:
-        return wraps(function)(lambda x: function(pairs.to_observation(x, circles)))
+        return wraps(function)(lambda x, **terms: function(pairs.to_observation(x, circles), **terms))
 
     return task._replace(
         cost=Cost(of_observation(task.cost.of_state)),

@@ -9,7 +9,9 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.math.circles import Circles, to_observation
+from pegasus_jax.tasks.terms import box
 from pegasus_jax.tasks.user_code import blamed, definition, line_of, place_of
+from pegasus_jax.types import Task
 
 UNBOUNDED = 1e6  # limits of an observation beyond this are none
 AROUND = 100  # random points
@@ -27,6 +29,23 @@ class Facts(NamedTuple):
     seen: np.ndarray  # [N, D] states, maybe none
     success: float = 0.2
     circles: Circles = ()  # of the observation that the user's cost gets
+    remembered: tuple[str, ...] = ()  # names of the last entries, which are of x' and not of x
+
+
+def beside(facts: Facts, task: Task) -> Facts:
+    """The facts of x' [D + M], from those of x and what is known of the task's memory."""
+    names = task.memory.names
+    if not names:
+        return facts
+    mean, std, low, high = box(task)
+    return facts._replace(
+        start_mean=np.concatenate([facts.start_mean, mean]),
+        start_std=np.concatenate([facts.start_std, std]),
+        low=np.concatenate([facts.low, low]),
+        high=np.concatenate([facts.high, high]),
+        seen=np.zeros((0, len(facts.start_mean) + len(names))),
+        remembered=names,
+    )
 
 
 def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
@@ -34,7 +53,7 @@ def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
 
     It is traced once, and evaluated with its gradient at the start, at zero and at 100 points around them.
     """
-    _traced(cost, len(facts.start_mean), len(facts.circles), what)
+    _traced(cost, facts, what)
     points, values, slopes = _evaluated(cost, facts, what)
     least, most = int(np.argmin(values)), int(np.argmax(values))
     if values[least] < -1e-5 * max(1, np.abs(values).max()):
@@ -104,8 +123,10 @@ def scales(facts: Facts) -> np.ndarray:
     return np.where(known > 0, known, 1.0)
 
 
-def _traced(cost: Callable[[Any], Any], size: int, pairs: int, what: str) -> None:
+def _traced(cost: Callable[[Any], Any], facts: Facts, what: str) -> None:
     """Raises ConfigError unless JAX can trace the cost to one number, and it reads no entry that is not there."""
+    size = len(facts.start_mean)
+    observed = size - len(facts.remembered) + len(facts.circles)
 
     def one(x: Any) -> Any:
         value = cost(x)
@@ -124,8 +145,8 @@ def _traced(cost: Callable[[Any], Any], size: int, pairs: int, what: str) -> Non
         raise
     for index, length, line in beyond(traced):
         raise ConfigError(
-            f"{what} reads entry {index} of {length}{_in(line)}, where JAX takes another; x has {size + pairs},"
-            f" 0 to {size + pairs - 1}"
+            f"{what} reads entry {index} of {length}{_in(line)}, where JAX takes another; x has {observed},"
+            f" 0 to {observed - 1}"
         )
 
 
@@ -228,5 +249,7 @@ def _in(place: str | None) -> str:
 
 
 def _text(state: np.ndarray, facts: Facts) -> str:
-    x = to_observation(state, facts.circles)
-    return f"x=[{', '.join(f'{v:.3g}' for v in x[:6])}{', ...' if len(x) > 6 else ''}]"
+    states = len(state) - len(facts.remembered)
+    x = to_observation(state[:states], facts.circles)
+    others = "".join(f", {name}={v:.3g}" for name, v in zip(facts.remembered, state[states:], strict=True))
+    return f"x=[{', '.join(f'{v:.3g}' for v in x[:6])}{', ...' if len(x) > 6 else ''}]{others}"

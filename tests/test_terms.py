@@ -1,0 +1,290 @@
+"""Costs of controls, time, references and goals: the same numbers in imagination, on a plant and on an environment."""
+
+from functools import partial
+from inspect import signature
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from pegasus_jax import episode, memory, tasks
+from pegasus_jax.assembly.experiments import build, compose
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.imagine import costs
+from pegasus_jax.runs import config_io, facts
+from pegasus_jax.runs.check import before_training
+from pegasus_jax.tasks import signals, starts, terms
+from pegasus_jax.types import Cost
+from probes import cart, tiny
+
+
+def parse(**words):
+    return config_io.parse(words)
+
+
+def price(x, u, previous_u, t, reference, goal):
+    """Every term with a weight that tells it from the others."""
+    rest = 2 * jnp.sum(u) + 3 * jnp.sum(previous_u) + 5 * t + 7 * jnp.sum(reference) + 11 * goal[0] + 13 * goal[1]
+    return jnp.sum(x) + rest
+
+
+def sine(t):
+    return jnp.sin(t)
+
+
+def goals(key):
+    return jax.random.uniform(key, (2,), minval=-0.3, maxval=0.3)
+
+
+# The names of its parameters
+
+
+def test_a_cost_says_by_names_what_it_takes():
+    assert terms.terms_of(lambda x: 0) == ()
+    assert terms.terms_of(lambda state, u: 0) == ("u",)
+    assert terms.terms_of(lambda x, t, previous_u, width=0.3, *rest, **more: 0) == ("t", "previous_u")
+    assert terms.terms_of(jax.jit(lambda x, goal: 0)) == ("goal",)
+    assert terms.terms_of(price) == terms.TERMS
+    assert terms.terms_of(partial(price, goal=3)) == ("u", "previous_u", "t", "reference")  # its owner's
+    assert terms.terms_of(lambda x, *, goal=3: 0) == ()
+
+
+@pytest.mark.parametrize(
+    ("cost", "said"),
+    [
+        (lambda x, v: 0, r"takes v, which nothing gives it; .*choices: u, previous_u, t, reference, goal"),
+        (lambda x, previous: 0, "did you mean 'previous_u'"),
+        (lambda x, goal: 0, "takes a goal, and there is none; give goal_low= and goal_high="),
+        (lambda x, reference: 0, "takes a reference, and there is none; give reference=file.csv"),
+    ],
+)
+def test_a_cost_that_nobody_can_serve_is_one_line(cost, said):
+    with pytest.raises(ConfigError, match=said) as caught:
+        compose(tiny(), cart(), cost=cost)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ({"goal_low": "[0]", "goal_high": "[1]"}, "goal_low= and goal_high= is of no use: cost=.* no parameter goal"),
+        ({"goal_low": "[0,0]", "goal_high": "[1]"}, "goal_low has 2 entries and goal_high 1"),
+        ({"goal_low": "[0]", "goal_high": "[0]"}, "goal_low=0 must be less than goal_high=0"),
+        ({"goal_low": "[0]", "goal_high": "[1]", "goals": goals}, "leave out goal_low= and goal_high="),
+        ({"goals": lambda key: jnp.zeros((2, 2))}, r"returns an array of shape \(2, 2\); expected one number or"),
+        ({"goals": "nowhere:goals"}, "goals=nowhere:goals cannot be imported"),
+        ({"reference": lambda t: jnp.nan}, "expected finite numbers"),
+        (
+            {"reference": "lost.csv"},
+            "reference=lost.csv is not there; expected a file .csv or .npz, or module:function",
+        ),
+        ({"starts": "[[0,0]]"}, r"a row of starts has 2 entries; expected 4: x \[m\], "),
+    ],
+)
+def test_settings_that_cannot_be_are_one_line(words, said):
+    with pytest.raises(ConfigError, match=said) as caught:
+        tasks.of_config(parse(task="cartpole", **words))
+    assert "\n" not in str(caught.value)
+
+
+# What a cost gets, and when
+
+
+@pytest.fixture(scope="module")
+def run():
+    """An experiment whose cost takes everything, and an episode of it."""
+    config = parse(
+        task="cartpole", cost=price, reference=sine, goals=goals, **{"search.cost_width_start": "1"}, **SMALL
+    )
+    exp = build(config)
+    ran = jax.jit(exp.episode)(jax.random.key(2), jax.jit(exp.init)(jax.random.key(1)).policy.params, True)
+    return exp, ran
+
+
+SMALL = {
+    "model": "log_normal",
+    "model.hidden": "[8]",
+    "policy.hidden": "[8]",
+    "fit.steps": "3",
+    "search.steps": "2",
+    "search.particles": "16",
+    "search.refine_fraction": "0",
+    "search.init": "previous",
+    "trials": "2",
+}
+
+
+def test_a_cost_of_a_state_gets_the_control_that_led_to_it_the_one_before_and_its_time(run):
+    exp, ran = run
+    task, (x, u) = exp.task, (np.asarray(ran.x), np.asarray(ran.u))
+    before = np.concatenate([np.zeros((1, 1)), u[:-1]])
+    t, goal = 0.1 * np.arange(1, 26), np.asarray(ran.memory)[-2:]
+    rest = 2 * u[:, 0] + 3 * before[:, 0] + 5 * t + 7 * np.sin(t) + 11 * goal[0] + 13 * goal[1]
+    found = jax.vmap(task.cost.of_state)(episode.states(task, ran)[1:])
+    np.testing.assert_allclose(found, x[1:].sum(1) + rest, rtol=1e-4)
+    # On the plant it is the same but for the noise of its sensors, .01 in each of four entries.
+    np.testing.assert_allclose(ran.cost, found, atol=0.12)
+    assert np.any(ran.cost != found)
+
+
+def test_imagined_costs_are_those_of_the_imagined_controls(run):
+    exp, ran = run
+    state = jax.jit(exp.add_episode)(jax.jit(exp.init)(jax.random.key(1)), ran)
+    rolled, cost = jax.jit(exp.imagine)(state)
+    x, u = np.asarray(rolled.x)[1:, :, :4], np.asarray(rolled.u)[..., 0]
+    before = np.concatenate([np.zeros((1, 16)), u[:-1]])
+    t, goal = 0.1 * np.arange(1, 26)[:, None], np.asarray(rolled.x)[0, :, -2:]
+    rest = 2 * u + 3 * before + 5 * t + 7 * np.sin(t) + 11 * goal[:, 0] + 13 * goal[:, 1]
+    np.testing.assert_allclose(cost, x.sum(-1) + rest, rtol=1e-3, atol=1e-3)
+    assert np.ptp(goal, 0).min() > 0.1  # each particle has a goal of its own
+
+
+def test_the_policy_sees_goal_reference_and_the_control_before_in_units_of_their_size(run):
+    task = run[0].task
+    assert memory.seen_names(task)[4:] == (
+        "force [N] 1 before",
+        "t [s]",
+        *("reference 0", "reference 0 in 0.1 s", "reference 0 in 0.3 s"),
+        *("goal 0", "goal 1"),
+    )
+    m = jnp.array([4.0, 3.0, 0.5, 0.1, -0.2])
+    seen = memory.steps(task.memory)[0](m, jnp.zeros(4))[4:]
+    np.testing.assert_allclose(seen, [4, 0.5, np.sin(0.5), np.sin(0.6), np.sin(0.8), 0.1, -0.2], rtol=1e-5)
+    units = memory.units(task.memory)
+    assert units[:2] == (10.0, 2.5)
+    rms = np.sqrt(np.mean(np.sin(0.1 * np.arange(29)) ** 2))
+    np.testing.assert_allclose(units[2:], [rms] * 3 + [0.3 / 3**0.5] * 2, rtol=0.1)
+    scale = tasks.input_scale(task, ())
+    np.testing.assert_allclose(scale, [1, 1, 1, *(1 / np.array(units)), 1, 1])
+
+
+def test_goals_of_episodes_differ_and_are_those_of_the_limits():
+    config = parse(task="cartpole", cost=lambda x, goal: x[0] - goal[0], goal_low="[1,2]", goal_high="[3,2.5]")
+    remembered = tasks.whole(tasks.of_config(config)).memory
+    keys = jax.random.split(jax.random.key(0), 30)
+    drawn = np.asarray(jax.vmap(lambda key: memory.begin(remembered, key, jnp.zeros(4)))(keys))
+    assert drawn.shape == (30, 2)
+    assert drawn.min(0)[0] < 1.3 < 2.7 < drawn.max(0)[0]
+    assert np.all((drawn >= [1, 2]) & (drawn <= [3, 2.5]))
+
+
+ONE = SMALL | {"search.cost_width_start": "1"}
+
+
+def test_what_has_no_terms_is_as_it_was():
+    """No memory, and the very functions of before."""
+    cost = Cost(lambda x: x[0])
+    task = tasks.whole(cart()._replace(cost=cost))
+    assert task.memory.names == ()
+    assert task.cost is cost
+
+
+# Expectations
+
+
+def test_the_expectation_of_a_cost_of_controls_is_that_of_their_gaussian(x64):
+    """A quadratic cost of x and u, whose expectation is known: by 512 nodes, from matched particles."""
+    task = terms.whole(cart()._replace(cost=Cost(lambda x, u, previous_u: (x[0] + u[0] - 2 * previous_u[0]) ** 2)))
+    assert task.memory.matched
+    spread = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0.5, 0, 1, 0], [-0.3, 0, 0.2, 1]])
+    particles = jax.random.normal(jax.random.key(0), (100, 4)) @ spread.T + jnp.array([0.1, 0, 0.2, -0.3])
+    weights = np.array([1.0, 0, 1, -2])
+    mean, cov = np.mean(particles, 0), np.cov(particles.T)
+    found = costs.of_matched(task.cost)(particles[None])
+    np.testing.assert_allclose(found, [[(weights @ mean) ** 2 + weights @ cov @ weights]], rtol=1e-6)
+
+
+def test_a_closed_form_of_the_state_alone_cannot_serve_a_cost_of_controls():
+    with pytest.raises(ConfigError, match="leave its expected out"):
+        compose(tiny(), cart(), cost=Cost(lambda x, u: x[0], lambda mean, cov: mean[0]))
+
+
+def test_goals_switch_matching_off_and_a_reference_does_not():
+    def task(**words):
+        return tasks.whole(tasks.of_config(parse(task="cartpole", **words)))
+
+    assert not task(cost=lambda x, goal: goal[0], goals=goals).memory.matched
+    assert task(cost=lambda x, reference, t: t, reference=sine).memory.matched
+
+
+# References of files
+
+
+def test_a_file_is_a_line_between_its_rows_and_holds_its_ends(tmp_path):
+    (tmp_path / "named.csv").write_text("t,a,b\n0,1,10\n1,3,10\n2,3,-10\n")
+    (tmp_path / "bare.csv").write_text("0,1,10\n1,3,10\n2,3,-10\n\n")
+    np.savez(tmp_path / "arrays.npz", t=[0.0, 1, 2], values=[[1.0, 10], [3, 10], [3, -10]])
+    for name in ("named.csv", "bare.csv", "arrays.npz"):
+        value = signals.reference_of(str(tmp_path / name))
+        for t, expected in ((-1, [1, 10]), (0.25, [1.5, 10]), (1.5, [3, 0]), (9, [3, -10])):
+            np.testing.assert_allclose(value(jnp.asarray(float(t))), expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "said"),
+    [
+        ("back.csv", "0,1\n2,1\n1,1\n", r"times \[s\] must increase, and 1 follows 2"),
+        ("alone.csv", "t\n0\n1\n", r"no values beside the times \[s\]"),
+        ("empty.csv", "t,a\n", "no values"),
+        ("words.csv", "t,a\n0,1\n1,up\n", "cannot be read as times and values: could not convert string to float"),
+        ("nan.csv", "0,1\n1,nan\n", "has nan in row 2"),
+        ("ragged.csv", "0,1\n1,1,2\n", "cannot be read as times and values"),
+    ],
+)
+def test_a_file_that_is_no_reference_is_one_line(tmp_path, name, text, said):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ConfigError, match=said) as caught:
+        signals.reference_of(str(tmp_path / name))
+    assert "\n" not in str(caught.value)
+
+
+# Starts
+
+
+def test_starts_are_drawn_equally_likely_with_the_spread_of_the_task():
+    task, keys = (
+        tasks.of_config(parse(task="cartpole", starts="[[0,0,0,0],[1,0,0,3.14]]")),
+        lambda: jax.random.split(jax.random.key(0), 400),
+    )
+    on_plant = np.asarray(jax.vmap(lambda key: task.plant.observe(task.plant.reset(key)))(keys()))
+    np.testing.assert_array_equal(on_plant, jax.vmap(partial(starts.start, task=task))(keys()))
+    upright = on_plant[:, 3] > 1.57
+    assert 0.4 < upright.mean() < 0.6
+    np.testing.assert_allclose(on_plant[upright].mean(0), [1, 0, 0, 3.14], atol=0.05)
+    np.testing.assert_allclose(on_plant[upright].std(0), [0.2] * 4, atol=0.05)
+    np.testing.assert_allclose(task.start_mean, [0.5, 0, 0, 1.57], atol=1e-6)
+    np.testing.assert_allclose(task.start_std, np.hypot([0.5, 0, 0, 1.57], 0.2), rtol=1e-6)
+
+
+# What is checked, and what a folder keeps
+
+
+def test_a_cost_is_checked_with_all_that_it_takes():
+    def checked(cost):
+        config = parse(task="cartpole", cost=cost, **ONE)
+        return before_training(config, build(config).task)
+
+    assert checked(lambda x, u: 1 - jnp.exp(-(x[0] ** 2) - u[0] ** 2 / 100)) == []
+    with pytest.raises(ConfigError, match=r"negative, at x=\[.*\], force \[N\] 1 before=.*is it a reward"):
+        checked(lambda x, u: -(u[0] ** 2))
+    with pytest.raises(ConfigError, match=r"has a gradient that is nan at x=\[.*2 before="):
+        checked(lambda x, u, previous_u: jnp.linalg.norm(u - previous_u) + jnp.linalg.norm(x - x))
+    with pytest.raises(ConfigError, match=r"reads entry 1 of 1"):
+        checked(lambda x, u: 1 - jnp.exp(-(u[1] ** 2)))
+    with pytest.raises(ConfigError, match=r"more than 1|TypeError"):
+        checked(lambda x, u: len(3))
+
+
+def test_a_folder_keeps_the_terms_the_reference_and_the_size_of_goals(run):
+    task = run[0].task
+    kept = facts.of_task(task)
+    assert kept["terms"] == list(terms.TERMS)
+    read = facts.to_task(kept, "run.json")
+    assert facts.difference(kept, facts.of_task(tasks.whole(read))) is None
+    restored = tasks.whole(read)
+    assert restored.memory.names == task.memory.names
+    assert restored.memory.shown == task.memory.shown
+    np.testing.assert_allclose(restored.memory.shown_units, task.memory.shown_units, rtol=1e-5)
+    np.testing.assert_allclose(restored.reference.value(0.35), (np.sin(0.3) + np.sin(0.4)) / 2, rtol=1e-5)
+    assert [*signature(read.cost.of_state).parameters] == ["x", *terms.TERMS]
