@@ -8,12 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from folders import a_run
 from pegasus_jax import episode, memory, tasks
 from pegasus_jax.assembly.experiments import build, compose
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs
 from pegasus_jax.runs import config_io, facts
 from pegasus_jax.runs.check import before_training
+from pegasus_jax.runs.controller import controller
+from pegasus_jax.runs.restore import restored
 from pegasus_jax.tasks import signals, starts, terms
 from pegasus_jax.types import Cost
 from probes import cart, tiny
@@ -288,3 +291,35 @@ def test_a_folder_keeps_the_terms_the_reference_and_the_size_of_goals(run):
     np.testing.assert_allclose(restored.memory.shown_units, task.memory.shown_units, rtol=1e-5)
     np.testing.assert_allclose(restored.reference.value(0.35), (np.sin(0.3) + np.sin(0.4)) / 2, rtol=1e-5)
     assert [*signature(read.cost.of_state).parameters] == ["x", *terms.TERMS]
+
+
+@pytest.mark.slow
+def test_the_controller_is_given_goals_and_references(tmp_path):
+    """Beside the policy itself, which is given by hand what the controller remembers."""
+    words = dict(cost=price, reference=sine, goals=goals, **ONE)
+    task = tasks.whole(tasks.of_config(parse(task="cartpole", **words)))
+    plain = {name.replace(".", "__"): value for name, value in ONE.items() if name not in ("model", "trials")}
+    control = controller(a_run(tmp_path / "run", made=task, **plain), trial="last")
+    _, experiment, state = restored(tmp_path / "run")
+    x = np.array([0.1, -0.2, 0.3, 3.0])
+    with pytest.raises(ValueError, match="set goal, 2 numbers, before it is called"):
+        control(x)
+    with pytest.raises(ValueError, match="a goal is 2 finite numbers"):
+        control.goal = [1.0]
+
+    def by_hand(before, t, reference):
+        seen = [*x, before, t, *(reference(t + ahead) for ahead in (0, 0.1, 0.3)), 0.2, -0.1]
+        return experiment.policy.apply(state.policy.params, None, jnp.array(seen))
+
+    control.goal = [0.2, -0.1]
+    for reference in (sine, lambda t: 0.3 + 0 * t):
+        control.reset()
+        before = 0.0
+        for period in range(3):
+            u = control(x)
+            np.testing.assert_allclose(u, by_hand(before, 0.1 * period, reference), rtol=1e-4)
+            before = u[0]
+        control.reference = 0.3
+    control.reference = [0.3, 0.4]
+    with pytest.raises(ValueError, match="a reference is 1 finite numbers"):
+        control(x)

@@ -115,6 +115,12 @@ def goal_names(task: Task) -> tuple[str, ...]:
     return () if task.goal is None else tuple(f"goal {i}" for i in range(len(task.goal.units)))
 
 
+def reference_names(task: Task, ahead: int) -> tuple[str, ...]:
+    """The names of a reference so many periods from now, among what a memory shows."""
+    later = f" in {ahead * task.dt:g} s" if ahead else ""
+    return () if task.reference is None else tuple(f"reference {i}{later}" for i in range(len(task.reference.units)))
+
+
 def memories(task: Task, terms: tuple[str, ...]) -> list[Memory]:
     """What has to be remembered for these terms, and what of it the policy sees: all that it can act upon."""
     found = []
@@ -147,8 +153,7 @@ def clock(task: Task, timed: bool) -> Memory:
     begun, signal = recall.clock(task.dt), task.reference
     shown, units = ([CLOCK], [task.horizon * task.dt]) if timed else ([], [])
     for ahead in AHEAD if signal is not None else ():
-        later = f" in {ahead * task.dt:g} s" if ahead else ""
-        shown += [f"reference {i}{later}" for i in range(len(signal.units))]
+        shown += reference_names(task, ahead)
         units += signal.units
 
     def show(m: Array, o: Array) -> Array:
