@@ -208,7 +208,13 @@ def test_every_block_is_a_program_a_file_or_commands() -> None:
             for command in commands(block) if block.kind in ("", "bash", "sh") else ():
                 assert shlex.split(command)[0].startswith(("pegasus-", "make", "python", "cc")), command
     of_plants = {"mymodule.py", "arm.xml", "robot.py", "drive.py"}
-    assert {block.file for block in FILES} == of_plants | {"on_robot.py", "robot.c", "in_runtimes.py", "export_both.py"}
+    assert {block.file for block in FILES} == of_plants | {
+        "lean.py",
+        "on_robot.py",
+        "robot.c",
+        "in_runtimes.py",
+        "export_both.py",
+    }
     assert len(PROGRAMS) >= 4
 
 
