@@ -66,6 +66,8 @@ TASKS: dict[str, tuple[str, ...]] = {
         f"cost={HERE}:reach",
         "goal_low=[-0.14,-0.14]",
         "goal_high=[0.14,0.14]",
+        "control_low=[-0.1,-0.1]",  # its motors turn it by 200 rad/s^2 at 1
+        "control_high=[0.1,0.1]",
         "dt=0.04",
         "horizon=50",
     ),
