@@ -143,21 +143,20 @@ def test_imagined_costs_are_those_of_the_imagined_controls(run):
     assert np.ptp(goal, 0).min() > 0.1  # each particle has a goal of its own
 
 
-def test_the_policy_sees_goal_reference_and_the_control_before_in_units_of_their_size(run):
+def test_the_policy_sees_goal_and_reference_in_units_of_their_size(run):
     task = run[0].task
     assert memory.seen_names(task)[4:] == (
-        "force [N] 1 before",
         "t [s]",
         *("reference 0", "reference 0 in 0.1 s", "reference 0 in 0.3 s"),
         *("goal 0", "goal 1"),
     )
     m = jnp.array([4.0, 3.0, 0.5, 0.1, -0.2])
     seen = memory.steps(task.memory)[0](m, jnp.zeros(4))[4:]
-    np.testing.assert_allclose(seen, [4, 0.5, np.sin(0.5), np.sin(0.6), np.sin(0.8), 0.1, -0.2], rtol=1e-5)
+    np.testing.assert_allclose(seen, [0.5, np.sin(0.5), np.sin(0.6), np.sin(0.8), 0.1, -0.2], rtol=1e-5)
     units = memory.units(task.memory)
-    assert units[:2] == (10.0, 2.5)
+    assert units[0] == 2.5
     rms = np.sqrt(np.mean(np.sin(0.1 * np.arange(29)) ** 2))
-    np.testing.assert_allclose(units[2:], [rms] * 3 + [0.3 / 3**0.5] * 2, rtol=0.1)
+    np.testing.assert_allclose(units[1:], [rms] * 3 + [0.3 / 3**0.5] * 2, rtol=0.1)
     scale = tasks.input_scale(task, ())
     np.testing.assert_allclose(scale, [1, 1, 1, *(1 / np.array(units)), 1, 1])
 
@@ -307,18 +306,15 @@ def test_the_controller_is_given_goals_and_references(tmp_path):
     with pytest.raises(ValueError, match="a goal is 2 finite numbers"):
         control.goal = [1.0]
 
-    def by_hand(before, t, reference):
-        seen = [*x, before, t, *(reference(t + ahead) for ahead in (0, 0.1, 0.3)), 0.2, -0.1]
+    def by_hand(t, reference):
+        seen = [*x, t, *(reference(t + ahead) for ahead in (0, 0.1, 0.3)), 0.2, -0.1]
         return experiment.policy.apply(state.policy.params, None, jnp.array(seen))
 
     control.goal = [0.2, -0.1]
     for reference in (sine, lambda t: 0.3 + 0 * t):
         control.reset()
-        before = 0.0
         for period in range(3):
-            u = control(x)
-            np.testing.assert_allclose(u, by_hand(before, 0.1 * period, reference), rtol=1e-4)
-            before = u[0]
+            np.testing.assert_allclose(control(x), by_hand(0.1 * period, reference), rtol=1e-4)
         control.reference = 0.3
     control.reference = [0.3, 0.4]
     with pytest.raises(ValueError, match="a reference is 1 finite numbers"):

@@ -125,7 +125,7 @@ def memories(task: Task, terms: tuple[str, ...]) -> list[Memory]:
     """What has to be remembered for these terms, and what of it the policy sees: all that it can act upon."""
     found = []
     if "u" in terms or "previous_u" in terms:
-        found.append(controls(task, "previous_u" in terms))
+        found.append(controls(task, 2 if "previous_u" in terms else 1))
     if "t" in terms or "reference" in terms:
         found.append(clock(task, "t" in terms))
     if "goal" in terms and task.goal is not None:
@@ -134,15 +134,10 @@ def memories(task: Task, terms: tuple[str, ...]) -> list[Memory]:
     return found
 
 
-def controls(task: Task, changes: bool) -> Memory:
-    """The newest control, and with `changes` the one before it: then the policy sees the newest. At rest it is 0."""
-    low, high = np.asarray(task.control_low, float), np.asarray(task.control_high, float)
-    made = recall.past_controls(task.control_names, np.clip(0.0, low, high), 2 if changes else 1, shown=False)
-    if not changes:
-        return made
-    size = len(low)
-    units = tuple(map(float, np.maximum(np.abs(low), np.abs(high))))
-    return made._replace(shown=made.names[:size], show=lambda m, o: m[:size], shown_units=units)
+def controls(task: Task, count: int) -> Memory:
+    """The newest `count` controls, which the policy does not see; before an episode they were 0, or what is nearest."""
+    rest = np.clip(np.zeros(len(task.control_names)), task.control_low, task.control_high)
+    return recall.past_controls(task.control_names, rest, count, shown=False)
 
 
 def clock(task: Task, timed: bool) -> Memory:
