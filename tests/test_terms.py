@@ -87,7 +87,7 @@ def test_a_cost_that_nobody_can_serve_is_one_line(cost, said):
 )
 def test_settings_that_cannot_be_are_one_line(words, said):
     with pytest.raises(ConfigError, match=said) as caught:
-        tasks.of_config(parse(task="cartpole", **words))
+        tasks.whole(tasks.of_config(parse(task="cartpole", **words)))
     assert "\n" not in str(caught.value)
 
 

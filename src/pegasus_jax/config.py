@@ -315,7 +315,7 @@ class Config:
     )
     goal_low: tuple[float, ...] = setting((), "least goals of episodes, drawn uniformly; [] where none are", EVERY)
     goal_high: tuple[float, ...] = setting((), "greatest goals", EVERY)
-    goals: str | Callable | None = setting(None, "module:function that draws an episode's goal from a key, in JAX", EVERY)  # noqa: RUF009 (frozen)
+    goals: str | Callable | None = setting(None, "module:function in JAX, key -> an episode's goal", EVERY)  # noqa: RUF009 (frozen)
     angles: tuple[int, ...] = setting((), "the entries of the observation that are angles [rad]", OWN)
     rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", (GYM,))
     circles: tuple[tuple[int, ...], ...] | None = setting(

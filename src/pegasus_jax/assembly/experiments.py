@@ -40,8 +40,7 @@ def compose(
     """The experiment of a config on any task, with pieces of your own in place of the configured or the task's ones.
 
     A `cost` may be a function of one state x [D] and, by these names, of u, previous_u, t, reference, goal. A
-    `searcher` improves the policy for `config.search.steps` steps;
-    what is imagined after a search is as configured.
+    `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
     With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
     does not suit the config: a cost without a width, for example, needs `search.cost_width_start=1`.
     """

@@ -89,7 +89,7 @@ def of_config(config: Config) -> Task:
         task = task._replace(cost=Cost(user_code.load("cost", config.cost)))
     if config.starts and task.environment is None:
         task = from_starts(task, config.starts)
-    return with_signals(sensed.sensed(task, config.sensors), config)
+    return sensed.sensed(with_signals(task, config), config.sensors)
 
 
 def rates_of(task: Task) -> tuple[int, ...]:
@@ -119,11 +119,11 @@ def input_scale(task: Task, units: tuple[float, ...]) -> Any:
 
     Raises ConfigError where they are not one for each state that is no angle.
     """
-    names = [name for i, name in enumerate(task.state_names) if i not in task.angles]
+    names = [task.state_names[i] for i in memory.measured(task) if i not in task.angles]
     if units and len(units) != len(names):
         raise ConfigError(f"policy.input_units={list(units)} must be {len(names)} numbers, of {', '.join(names)}")
     shown = [unit for i, unit in enumerate(memory.units(task.memory)) if i not in task.memory.shown_angles]
-    turning = 2 * (len(task.angles) + len(task.memory.shown_angles))
+    turning = 2 * len(memory.seen_angles(task))
     every = np.concatenate([1 / np.array([*(units or np.ones(len(names))), *shown]), np.ones(turning)])
     return every if units or any(unit != 1 for unit in shown) else 1.0
 

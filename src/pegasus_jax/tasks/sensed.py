@@ -1,6 +1,7 @@
 """A task seen through the sensors that there are: some entries, late, and without rates. One function, Task -> Task."""
 
 from collections.abc import Sequence
+from functools import wraps
 from typing import Any
 
 import jax
@@ -12,6 +13,7 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Sensors
 from pegasus_jax.math.circles import Circles, to_observation, to_state
 from pegasus_jax.memory import resting
+from pegasus_jax.tasks.terms import alone
 from pegasus_jax.types import Cost, Task
 
 
@@ -96,7 +98,7 @@ def _of(cost: Cost, whole: Any, place: np.ndarray) -> Cost:
         return expected(all_of, wide)
 
     return Cost(
-        lambda x: cost.of_state(whole(x)),
+        wraps(cost.of_state)(lambda x, **terms: cost.of_state(whole(x), **terms)),
         None if expected is None else moments,
         None if widen is None else lambda factor: _of(widen(factor), whole, place),
     )
@@ -107,7 +109,8 @@ def _blind(task: Task, missing: Sequence[int]) -> None:
     draw = np.random.default_rng(0)
     mean, std = np.asarray(task.start_mean, float), np.asarray(task.start_std, float) + 1.0
     states = jnp.asarray(mean + std * draw.normal(size=(32, len(mean))))
-    slopes = jax.vmap(jax.grad(lambda x: task.cost.of_state(x).astype(float)))(states)
+    cost = alone(task)
+    slopes = jax.vmap(jax.grad(lambda x: cost(x).astype(float)))(states)
     for entry in missing:
         if np.any(np.asarray(slopes)[:, entry] != 0):
             raise ConfigError(

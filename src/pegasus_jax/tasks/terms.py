@@ -105,6 +105,16 @@ def of_terms(task: Task, function: Callable[..., Array]) -> Cost:
     return Cost(of_state)
 
 
+def alone(task: Task) -> Callable[[Array], Array]:
+    """The cost of a task that is not whole as a function of x [D] alone, all else being 0."""
+    controls, cost = jnp.zeros(len(task.control_names)), task.cost.of_state
+    rest = {"u": controls, "previous_u": controls, "t": jnp.zeros(())}
+    for name, signal in (("reference", task.reference), ("goal", task.goal)):
+        rest[name] = jnp.zeros(0 if signal is None else len(signal.units))
+    terms = agree(cost, task.reference, task.goal)
+    return lambda x: cost(x, **{term: rest[term] for term in terms})
+
+
 def past(task: Task, before: int) -> tuple[str, ...]:
     """The names in a memory of the controls of so many periods ago."""
     return tuple(f"{name} {before} before" for name in task.control_names)
