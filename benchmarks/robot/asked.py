@@ -20,8 +20,12 @@ def close(square: Array, far: float, exact: float) -> Array:
 
 
 def swing_up(x: Array) -> Array:
-    """The cart-pole's own cost: [x, x', angle', angle], 0 hanging; the tip over the middle of the rail."""
-    return near((x[0] + POLE * jnp.sin(x[3])) ** 2 + (POLE * (jnp.cos(x[3]) + 1)) ** 2, WIDTH)
+    """[x, x', angle', angle], 0 hanging: the tip over the middle of the rail, by half as near as the project's own cost.
+
+    The other half falls from where the pole hangs: beside a cost that is flat there, doing nothing would be the best.
+    """
+    tip = (x[0] + POLE * jnp.sin(x[3])) ** 2 + (POLE * (jnp.cos(x[3]) + 1)) ** 2
+    return close(tip, 0.8, WIDTH)
 
 
 def swing_up_smoothly(x: Array, u: Array, previous_u: Array) -> Array:
