@@ -20,7 +20,7 @@ def close(square: Array, far: float, exact: float) -> Array:
 
 
 def swing_up(x: Array) -> Array:
-    """[x, x', angle', angle], 0 hanging: the tip over the middle of the rail, by half as near as the project's own cost.
+    """[x, x', angle', angle], 0 hanging: the tip over the middle of the rail, half of it the project's own cost.
 
     The other half falls from where the pole hangs: beside a cost that is flat there, doing nothing would be the best.
     """
