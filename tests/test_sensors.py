@@ -12,7 +12,7 @@ from scipy.signal import savgol_filter
 
 import folders
 from pegasus_jax import memory, tasks
-from pegasus_jax.assembly.experiments import blind, compose
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Sensors
 from pegasus_jax.episode import run
@@ -42,7 +42,7 @@ def sensing(name):
     config = tiny(**KINDS[name])
     task = cart(H)._replace(sensor_std=np.zeros(2))
     task = task if name != "history" else task._replace(cost=task.cost._replace(of_state=lambda x: x[0] ** 2))
-    return config, blind(remembering(config, sensed(task, config.sensors)))
+    return config, tasks.whole(remembering(config, sensed(task, config.sensors)))
 
 
 def exact(task):

@@ -1,5 +1,7 @@
 """Costs of controls, time, references and goals: the same numbers in imagination, on a plant and on an environment."""
 
+import json
+import runpy
 from functools import partial
 from inspect import signature
 
@@ -12,11 +14,14 @@ from folders import a_run
 from pegasus_jax import episode, memory, tasks
 from pegasus_jax.assembly.experiments import build, compose
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.exports.drive import drives
+from pegasus_jax.exports.write import export
 from pegasus_jax.imagine import costs
 from pegasus_jax.runs import config_io, facts
 from pegasus_jax.runs.check import before_training
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.runs.restore import restored
+from pegasus_jax.runs.start import train
 from pegasus_jax.tasks import signals, starts, terms
 from pegasus_jax.types import Cost
 from probes import cart, tiny
@@ -319,3 +324,43 @@ def test_the_controller_is_given_goals_and_references(tmp_path):
     control.reference = [0.3, 0.4]
     with pytest.raises(ValueError, match="a reference is 1 finite numbers"):
         control(x)
+
+
+def hold(x, u, previous_u, goal):
+    """Gymnasium's pendulum at an angle."""
+    away = 1 - x[0] * jnp.cos(goal[0]) - x[1] * jnp.sin(goal[0])
+    return 1 - jnp.exp(-away / 0.1) + 0.01 * u[0] ** 2 + 0.02 * (u[0] - previous_u[0]) ** 2
+
+
+@pytest.mark.slow
+def test_a_robot_with_goals_from_the_first_episode_to_the_file_that_drives_it(tmp_path):
+    """What is stored can be counted again by hand, and the file is the controller that was asked for the goal."""
+    small = SMALL | {"eval_episodes": "0", "horizon": "6", "env": "Pendulum-v1", "circles": "[[0,1]]"}
+    small |= {"goal_low": "[-0.3]", "goal_high": "[0.3]"}
+    run = train("gym", out=tmp_path / "run", settings=small, cost=hold)
+    drawn = []
+    for trial in (1, 2):
+        found = np.load(run / "episodes" / f"{trial:04d}.npz")
+        seen, u, goal = found["observation"], found["u"], found["memory"][-1]
+        before = np.concatenate([np.zeros((1, 1), np.float32), u[:-1]])
+        drawn.append(goal)
+        expected = [hold(*row, np.array([goal])) for row in zip(seen[1:], u, before, strict=True)]
+        np.testing.assert_allclose(found["cost"], expected, rtol=1e-4)
+    assert drawn[0] != drawn[1]
+    assert np.all(np.abs(drawn) <= 0.3)
+    control, x = controller(run), np.array([0.6, 0.8, 0.1], np.float32)
+    file = runpy.run_path(str(export(run, out=tmp_path / "hold.py")))["Controller"]()
+    for goal in (-0.2, 0.1):
+        control.goal = goal
+        np.testing.assert_allclose(file([*x, goal]), control(x), rtol=1e-4)
+    assert control([0.6, 0.8, 0.1]) != file([0.6, 0.8, 0.1, -0.2])
+    kept = json.loads((tmp_path / "hold.py.json").read_text())
+    assert kept["observation"][-1] == {"name": "goal 0", "unit": None, "is": "asked for, no sensor's"}
+    assert (kept["filter"], kept["history"]) == ("none", "none")
+    (done,) = drives(run)
+    driven = np.load(done.log)
+    assert driven["cost"].shape == (6,)
+    assert abs(driven["memory"][-1]) <= 0.3
+    before = np.concatenate([np.zeros((1, 1), np.float32), driven["u"][:-1]])
+    rows = zip(driven["observation"][1:], driven["u"], before, strict=True)
+    np.testing.assert_allclose(driven["cost"], [hold(*row, driven["memory"][-1:]) for row in rows], rtol=1e-4)

@@ -31,7 +31,9 @@ def contract(learned: Learned, format: str, file: Path, data: bytes, parity: Par
         "numbers": learned.dtype.name,
         "period_s": float(task.dt),
         "observation": [
-            named(name) | ({"is": f"{cosines[i]} of an angle"} if i in cosines else {})
+            named(name)
+            | ({"is": f"{cosines[i]} of an angle"} if i in cosines else {})
+            | ({"is": "asked for, no sensor's"} if i >= len(learned.observation) - len(learned.asked) else {})
             for i, name in enumerate(learned.observation)
         ],
         "control": [named(name) | {"low": low, "high": high} for name, low, high in controls],

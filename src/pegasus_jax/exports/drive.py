@@ -14,12 +14,12 @@ import numpy as np
 from pegasus_jax import interrupt, tasks
 from pegasus_jax.checks import ConfigError, RunError, check_range
 from pegasus_jax.episode import Episode, drive, states
+from pegasus_jax.exports.asked import asking
 from pegasus_jax.exports.watchdog import Watchdog
 from pegasus_jax.exports.write import export
 from pegasus_jax.runs import restore, store
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.runs.files import write_whole
-from pegasus_jax.tasks import sensed
 from pegasus_jax.types import Task, Trajectory
 
 SLACK = 0.1  # of a period, by which a control may follow the one before it too late
@@ -91,8 +91,10 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
     log = run / FOLDER / f"{1 + max(store.numbered(run / FOLDER, '.npz'), default=0):04d}.npz"
     times: list[float] = []
     rows: list[Any] = []
+    act, memories = asking(control, task, seed)
 
     def save(ran: Episode) -> Drive:
+        ran = ran._replace(trajectory=ran.trajectory._replace(memory=memories[0] if memories else None))
         seen = states(task, ran.trajectory)[1:] if len(ran.trajectory.u) else []
         cost = np.asarray(jax.vmap(task.cost.of_state)(seen) if len(seen) else [], np.float32)
         kept = ran._replace(trajectory=ran.trajectory._replace(cost=cost))  # type: ignore[arg-type]
@@ -110,7 +112,7 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
 
     with Watchdog(limit, task.environment.close, last_words) as watch:
         on_time = task._replace(environment=timed(task.environment, task.dt, times, rows, watch.beat))
-        ran = drive(seed, lambda t, x: control(sensed.observation(x, task)), on_time)
+        ran = drive(seed, act, on_time)
     done = save(ran)
     if watch.fired:
         raise RunError(_stopped(task, limit, len(done.times), log))

@@ -13,7 +13,7 @@ from pegasus_jax.math.circles import entries
 from pegasus_jax.pilco.rbf import regress
 from pegasus_jax.runs.restore import precision
 from pegasus_jax.tasks.remembered import kept_by, remembering
-from pegasus_jax.types import NO_MEMORY, Params
+from pegasus_jax.types import NO_MEMORY
 
 
 class Recall(NamedTuple):
@@ -104,7 +104,7 @@ def layers_of(learned: Learned, format: str) -> tuple[Layer, ...]:
     settings, params, dtype = learned.config.policy, learned.params, learned.dtype
     match settings:
         case MLP():
-            middle = _network(settings, params, dtype)
+            middle = _network(settings, learned)
         case Linear():
             middle = [Dense(_array(params["weights"], dtype).T, _array(params["bias"], dtype), False)]
         case RBF():
@@ -152,10 +152,11 @@ def _features(learned: Learned) -> tuple[Layer, ...]:
     return layer, Features(tuple(i for i in seen if i not in turning), tuple((i,) for i in turning))
 
 
-def _network(settings: MLP, params: Params, dtype: np.dtype) -> list[Layer]:
+def _network(settings: MLP, learned: Learned) -> list[Layer]:
     """The layers of the mean of a network: noise on the units is its mean, which the kernels take in."""
+    params, dtype = learned.params, learned.dtype
     mean, scale = (_array(value, np.float64) for value in params["input"])
-    units = _units(settings, len(mean))
+    units = _units(settings, len(mean), learned)
     dense = [params["network"]["params"][f"layer_{i}"] for i in range(len(settings.hidden) + 1)]
     layers: list[Layer] = []
     if np.any(mean != 0) or np.any(scale * units != 1):
@@ -166,9 +167,12 @@ def _network(settings: MLP, params: Params, dtype: np.dtype) -> list[Layer]:
     return layers
 
 
-def _units(settings: MLP, features: int) -> np.ndarray:
+def _units(settings: MLP, features: int, learned: Learned) -> np.ndarray:
     """The unit of each feature; sines and cosines, the last ones, have none."""
-    return np.concatenate([settings.input_units, np.ones(features - len(settings.input_units))])
+    units = np.concatenate([settings.input_units, np.ones(features - len(settings.input_units))])
+    asked, last = learned.asked, features - 2 * len(learned.task.angles)
+    units[last - len(asked) : last] = asked
+    return units
 
 
 def _array(values: object, dtype: np.dtype | type) -> np.ndarray:

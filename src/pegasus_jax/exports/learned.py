@@ -23,6 +23,7 @@ class Learned(NamedTuple):
     task: Task
     policy: Policy
     params: Params
+    asked: tuple[float, ...] = ()  # the sizes of the last entries of the state, which are no sensors': exports/asked.py
 
     @property
     def title(self) -> str:

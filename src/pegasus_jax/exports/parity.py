@@ -8,9 +8,10 @@ import jax
 import numpy as np
 
 from pegasus_jax.checks import RunError
-from pegasus_jax.exports.learned import Learned, along
+from pegasus_jax.exports.learned import Learned, along, function
 from pegasus_jax.runs import store
 from pegasus_jax.runs.controller import Controller
+from pegasus_jax.runs.restore import precision
 from pegasus_jax.tasks import sensed
 from pegasus_jax.types import Task
 
@@ -44,6 +45,12 @@ def observations(run: Path, task: Task) -> tuple[np.ndarray, int]:
     episodes = [store.load_episode(run, trial) for trial in store.numbered(run / "episodes", ".npz")]
     seen = [np.asarray(episode.trajectory.x, float) for episode in episodes if episode is not None]
     start, std = np.asarray(task.start_mean, float), np.asarray(task.start_std, float)
+    # What the policy is asked for beside x is not among the stored rows.
+    more = [len(start) - rows.shape[1] for rows in seen]
+    seen = [
+        np.concatenate([rows, draw.uniform(-2, 2, (len(rows), m)) * std[len(std) - m :]], 1) if m else rows
+        for rows, m in zip(seen, more, strict=True)
+    ]
     every = np.concatenate([*seen, [start - std, start + std]])
     # One that remembers is given them in their order.
     stored = (every[:-2] if task.memory.names else draw.permutation(every[:-2]))[: OBSERVATIONS // 2]
@@ -61,12 +68,7 @@ def compared(run: Callable[[np.ndarray], np.ndarray], learned: Learned, referenc
     task = learned.task
     given, stored = observations(folder, task)
     given = given.astype(learned.dtype)
-    expected = []
-    for number, x in enumerate(given):
-        if number % EPISODE == 0:
-            reference.reset()
-        expected.append(reference(x))
-    expected, found = np.stack(expected), run(given)
+    expected, found = policys(learned, reference, given), run(given)
     if found.shape != expected.shape:
         raise RunError(f"the file returns controls {[*found.shape]}, the policy {[*expected.shape]}; it was not kept")
     span = np.asarray(task.control_high) - np.asarray(task.control_low)
@@ -80,6 +82,19 @@ def compared(run: Callable[[np.ndarray], np.ndarray], learned: Learned, referenc
             f" {worst.tolist()}; at most {parity.allowed:.2g} is allowed, and it was not kept"
         )
     return parity
+
+
+def policys(learned: Learned, reference: Controller, given: np.ndarray) -> np.ndarray:
+    """The controls [N, U] of a policy, as its `controller` gives them; of rows that ask for something, as they do."""
+    if learned.asked:
+        with precision(learned.config):
+            return np.asarray(jax.jit(jax.vmap(function(learned)))(given))
+    expected = []
+    for number, x in enumerate(given):
+        if number % EPISODE == 0:
+            reference.reset()
+        expected.append(reference(x))
+    return np.stack(expected)
 
 
 def exact(learned: Learned, given: np.ndarray) -> np.ndarray:

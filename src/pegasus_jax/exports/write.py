@@ -14,6 +14,7 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError, choice
 from pegasus_jax.exports import as_c, as_numpy, as_onnx, as_stablehlo
+from pegasus_jax.exports.asked import observed
 from pegasus_jax.exports.contract import contract
 from pegasus_jax.exports.learned import Learned
 from pegasus_jax.exports.parity import compared
@@ -59,7 +60,8 @@ def export(
     reference = Controller(run, trial)
     config, experiment, state = restore.restored(run, reference.trial)
     name = run.resolve().name
-    learned = Learned(name, reference.trial, config, experiment.task, experiment.policy, state.policy.params)
+    task, asked = observed(experiment.task)
+    learned = Learned(name, reference.trial, config, task, experiment.policy, state.policy.params, asked)
     data = made.write(learned, file.stem)
     with tempfile.TemporaryDirectory() as folder:
         (unproven := Path(folder) / file.name).write_bytes(data)

@@ -43,13 +43,15 @@ def of_task(task: Task) -> dict[str, Any]:
 
 def asked(task: Task) -> dict[str, Any]:
     """What a cost takes beside the state: names, a reference as its values along an episode, the sizes of goals."""
-    if not task.terms:
-        return {}
     import jax
 
     from pegasus_jax.tasks.signals import times
+    from pegasus_jax.tasks.terms import terms_of
 
-    told: dict[str, Any] = {"terms": list(task.terms)}
+    terms = terms_of(task.cost.of_state) if task.terms is None else task.terms
+    if not terms:
+        return {}
+    told: dict[str, Any] = {"terms": list(terms)}
     if task.reference is not None:
         told["reference"] = np.asarray(jax.vmap(task.reference.value)(times(task)), float).tolist()
     if task.goal is not None:

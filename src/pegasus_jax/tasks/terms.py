@@ -131,6 +131,12 @@ def reference_names(task: Task, ahead: int) -> tuple[str, ...]:
     return () if task.reference is None else tuple(f"reference {i}{later}" for i in range(len(task.reference.units)))
 
 
+def asked_names(task: Task) -> tuple[str, ...]:
+    """What a policy sees of its memory that somebody sets: the time, a reference, a goal, in their order there."""
+    references = [name for ahead in AHEAD for name in reference_names(task, ahead)]
+    return tuple(name for name in task.memory.shown if name in (CLOCK, *references, *goal_names(task)))
+
+
 def memories(task: Task, terms: tuple[str, ...]) -> list[Memory]:
     """What has to be remembered for these terms, and what of it the policy sees: all that it can act upon."""
     found = []
