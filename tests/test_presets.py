@@ -154,6 +154,8 @@ def test_the_method_has_few_settings():
         "horizon",
         "dt",
         "env_args",
+        "state_names",
+        "control_names",
         "stop",
         "stop_cost",
         "observe",

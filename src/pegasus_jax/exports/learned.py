@@ -34,7 +34,9 @@ class Learned(NamedTuple):
 
     @property
     def observation(self) -> tuple[str, ...]:
-        """Names of the entries of an observation [O]; those of a cosine and a sine are x0, x1, ..."""
+        """Names of the entries of an observation [O]; without any, a cosine and a sine are x0, x1, ..."""
+        if self.config.state_names:
+            return self.config.state_names
         task, size = self.task, len(self.task.state_names) + len(self.task.circles)
         kept = dict(zip(entries(size, task.circles), task.state_names, strict=True))
         paired = {entry for pair in task.circles for entry in pair}
