@@ -333,11 +333,11 @@ def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> 
 
 
 def camera(config: Config) -> Callable[[], np.ndarray]:
-    """Open the environment of a config, which is not open yet, so that it renders; a picture [height, width, 3] a call.
+    """Open the environment of a config so that it renders; each call is a picture [height, width, 3] of 8-bit colors.
 
     Raises ConfigError, in one line, for one that cannot; where it says so itself, before it is opened.
     """
-    from pegasus_envs.gym_plant import picture, render_modes
+    from pegasus_envs.gym_plant import close_env, picture, render_modes
     from pegasus_envs.render import without_display
 
     without_display()
@@ -348,6 +348,7 @@ def camera(config: Config) -> Callable[[], np.ndarray]:
         known = render_modes(config.env or "")
     if known is not None and "rgb_array" not in known:
         raise ConfigError(f"{refusal}, {list(known)}")
+    interrupt.let_go(lambda: close_env(config.env or "", config.env_args))
     env = environment(config, render_mode="rgb_array")
     if "rgb_array" not in (env.metadata or {}).get("render_modes", ()):
         raise ConfigError(refusal)

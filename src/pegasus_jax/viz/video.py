@@ -100,7 +100,7 @@ def driven(run: Path, task: Task, trial: int, seeds: range) -> Iterator[tuple[Tr
         ran = episode.drive(seed, lambda t, x: control(to_observation(x, task.circles)), watched)
         failed(ran, task, kept=False)
         cost = jax.vmap(task.cost.of_state)(jnp.asarray(ran.trajectory.x)[1:])
-        yield ran.trajectory._replace(cost=cost), drawn
+        yield ran.trajectory._replace(cost=cost), drawn or [fitted(look())]
 
 
 def filmed(environment: Any, look: Callable[[], np.ndarray], every: int, drawn: list[np.ndarray]) -> Any:
@@ -109,7 +109,7 @@ def filmed(environment: Any, look: Callable[[], np.ndarray], every: int, drawn: 
 
     def step(u: np.ndarray) -> tuple[Any, ...]:
         answer = environment.step(u)
-        if next(steps) % every == 0 or answer[2] or not drawn:
+        if next(steps) % every == 0 or answer[2]:
             drawn.append(fitted(look()))
         return answer
 
