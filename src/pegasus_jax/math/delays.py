@@ -85,8 +85,11 @@ def _repeats(level: np.ndarray, controls: np.ndarray) -> bool:
 
 
 def _criterion(changes: np.ndarray, base: np.ndarray, controls: np.ndarray) -> float:
-    """The Bayesian information criterion of the changes [N, D] as a linear function of what is known."""
-    known = np.column_stack([base, controls])
-    rest = changes - known @ np.linalg.lstsq(known, changes, rcond=None)[0]
-    share = np.maximum(np.mean(rest**2, axis=0) / np.var(changes, axis=0), EXACT)
-    return float(np.sum(len(rest) * np.log(share) + known.shape[1] * np.log(len(rest))))
+    """The Bayesian information criterion of the changes [N, D] as a linear function of what is known.
+
+    Of all entries at once, by their covariance: what the regression misses, several of them miss together.
+    """
+    (count, size), known = changes.shape, np.column_stack([base, controls])
+    rest = (changes - known @ np.linalg.lstsq(known, changes, rcond=None)[0]) / np.std(changes, axis=0)
+    spread = np.linalg.slogdet(rest.T @ rest / count + EXACT * np.eye(size))[1]
+    return float(count * spread + size * known.shape[1] * np.log(count))
