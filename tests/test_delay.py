@@ -125,7 +125,7 @@ def test_noise_alone_has_no_delay() -> None:
 
 def test_an_answer_that_is_drowned_by_noise_is_less_sure() -> None:
     """A delay of 2 in sensors whose noise grows: the probability of the truth falls, that of nothing rises."""
-    draw, stds = np.random.default_rng(1), (0.01, 1.5, 30.0)
+    draw, stds = np.random.default_rng(1), (0.01, 3.0, 30.0)
     chances = np.zeros((3, 10))
     for _ in range(20):
         u = draw.choice([-1.0, 1.0], (300, 1))
