@@ -210,7 +210,7 @@ def command(module: str, function: str, *words: str) -> subprocess.CompletedProc
 
 @pytest.mark.slow
 def test_commands_learn_from_it_drive_it_and_lose_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its side is killed while it is driven: one line, and the rows until then; the next command says where to look."""
+    """Its side is killed while it is driven: one line, and the rows until then."""
     monkeypatch.chdir(tmp_path)
     program = [sys.executable, "-u", str(EXAMPLE / "robot_side.py"), "port=0", "period=0.02"]
     side = subprocess.Popen(program, stdout=subprocess.PIPE, text=True)
@@ -239,8 +239,6 @@ def test_commands_learn_from_it_drive_it_and_lose_it(tmp_path: Path, monkeypatch
     with np.load("run/driven/0001.npz") as log:
         assert log["u"].shape == (int(kept[1]), 1)
         assert np.isfinite(log["cost"]).all()
-    done = command("drive", "run", "run")
-    assert (done.returncode, done.stderr.count("no robot at 127.0.0.1")) == (2, 1)
 
 
 def _kill_when_driven(side: subprocess.Popen[str], drivers: int) -> None:
