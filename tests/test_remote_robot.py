@@ -18,7 +18,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from pegasus_jax.runs import store
+from pegasus_jax.runs import config_io, store
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "remote_robot"
 NAMES = ("messages", "robot_side", "remote_robot")
@@ -259,3 +259,5 @@ def test_its_readme_has_the_commands_of_its_programs() -> None:
         assert first in readme or name == "robot_side"
         assert f"`{name}.py`" in readme
     assert "python robot_side.py host=127.0.0.1 port=5555 period=0.05" in readme
+    words = re.findall(r"pegasus-train (task=.*?) out=", readme)[0].split()
+    assert config_io.parse(config_io.split(words)[1]).env == "remote_robot:Remote-v0"
