@@ -82,5 +82,5 @@ def told(measured: Measured) -> str:
     sure = f"probability {chance[count]:.2f}{''.join(f', {other}' for other in others)}; {delay.rows} periods"
     return (
         f"{name}delay {count} {'period' if count == 1 else 'periods'}, {count * task.dt:g} s ({sure});"
-        f" give sensors.delay={count}{note}"
+        f" {f'give sensors.delay={count}' if count else 'no sensors.delay= is needed'}{note}"
     )
