@@ -110,7 +110,16 @@ J = partial(pg.objective, **PIECES, cost=pg.costs.of_particles(TASK.cost))
 # An example of every exported function; what it returns must be finite
 
 EXAMPLES: dict[str, Callable[[], Any]] = {}
-IMPURE = {"build", "compose", "controller", "export", "tasks.make", "tasks.of_config", "angles.feature_names"}
+IMPURE = {
+    "build",
+    "compose",
+    "controller",
+    "delay_of",
+    "export",
+    "tasks.make",
+    "tasks.of_config",
+    "angles.feature_names",
+}
 
 
 def example(*names: str) -> Callable[[Callable[[], Any]], Callable[[], Any]]:
@@ -168,6 +177,16 @@ def test_a_controller_of_a_run(tmp_path: Any) -> None:
     assert isinstance(control, pg.Controller)
     assert control(np.zeros(4)).shape == (1,)
     assert pg.export(tmp_path / "run", out=tmp_path / "act.py").exists()
+
+
+@example("delay_of")
+def _() -> Any:
+    u = np.random.default_rng(0).choice([-1.0, 1.0], (150, 1))
+    x = np.cumsum(np.concatenate([np.zeros((2, 1)), u[:-1]]), 0) + 1e-3 * np.random.default_rng(1).normal(size=(151, 1))
+    found = pg.delay_of([(x, u)])
+    assert isinstance(found, pg.Delay)
+    assert found.periods == 1
+    return found.probabilities
 
 
 @example("dynamics_of", "bnn", "ensemble", "lagrangian", "gp", "ssgp")

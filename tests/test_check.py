@@ -133,6 +133,9 @@ def test_a_mujoco_file_is_checked_without_a_robot(tmp_path: Path) -> None:
     assert "degrees?" in said
 
 
+NAMES = ("angle [rad]", "rate [deg/s]")
+
+
 def facts(start: float) -> Facts:
     wide = np.full(2, np.inf)
     return Facts(np.array([start, 0.0]), np.zeros(2), (0,), -wide, wide, np.zeros((0, 2)))
@@ -140,11 +143,11 @@ def facts(start: float) -> Facts:
 
 def test_angles_of_more_than_two_turns_are_degrees() -> None:
     at = lambda x: np.array([[x, 500.0]])  # noqa: E731
-    assert check.plausible(at(-6.0), facts(3.14)) == []
-    assert "more than a turn" in check.plausible(at(-7.0), facts(3.14))[0]
+    assert check.plausible(at(-6.0), facts(3.14), NAMES) == []
+    assert "more than a turn" in check.plausible(at(-7.0), facts(3.14), NAMES)[0]
     for reading, start in ((90.0, 0.0), (0.0, -180.0)):
-        with pytest.raises(ConfigError, match=r"degrees\? Return np.deg2rad"):
-            check.plausible(at(reading), facts(start))
+        with pytest.raises(ConfigError, match=r"angle \[rad\] is .*degrees\? Return np.deg2rad"):
+            check.plausible(at(reading), facts(start), NAMES)
 
 
 def test_readings_that_follow_from_others_are_named() -> None:

@@ -122,6 +122,8 @@ def newest(home: Path) -> dict[str, np.ndarray]:
 def test_a_robot_is_driven_by_the_policy_at_its_period(home: Path) -> None:
     done = driven(home, "episodes=2", "seconds=0.3", "trial=1")
     assert (done.code, done.asked) == (0, ["reset", "reset", "close"]), done.err
+    said = "the policy of trial 1 drives driven_robot:Driven-v0: x0, x1 -> u0 from -2 to 2; every 0.02 s for 0.3 s"
+    assert f"{said}, watchdog 0.5 s" in done.err.splitlines()
     lines = done.out.splitlines()
     assert len(lines) == 2
     assert lines[1].startswith("run/driven/0002.npz: 15 controls, mean cost 1.000, ended by horizon; ")

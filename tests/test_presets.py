@@ -158,6 +158,8 @@ def test_the_method_has_few_settings():
         "horizon",
         "dt",
         "env_args",
+        "state_names",
+        "control_names",
         "stop",
         "stop_cost",
         "observe",

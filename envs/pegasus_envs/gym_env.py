@@ -48,6 +48,7 @@ class PlantEnv(gymnasium.Env):
             raise ValueError(f"render_mode {render_mode!r}: only 'rgb_array' or None")
         self._compiled = _compile(plant, tuple(sorted((arguments or {}).items())))
         self.plant = self._compiled.plant
+        self.state_names, self.control_names = self.plant.state_names, self.plant.control_names
         self.metadata = {**self.metadata, "render_fps": max(1, round(1.0 / self.plant.dt))}
         self.render_mode = render_mode
         self._size, self._renderer = (width, height), None

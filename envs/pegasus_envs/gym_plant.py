@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import load_env_creator
 
 from pegasus_envs.plant import filled
 
@@ -30,6 +31,9 @@ class EnvSpec(NamedTuple):
     start_std: np.ndarray
     starts: np.ndarray
     """observations [N, D] where episodes start, equally likely; none where start_mean and start_std say it"""
+    state_names: tuple[str, ...] = ()
+    """of the observation's entries, as "angle [rad]"; none where they have no names"""
+    control_names: tuple[str, ...] = ()
 
 
 class EnvPlant(NamedTuple):
@@ -48,17 +52,33 @@ class EnvPlant(NamedTuple):
 _opened: dict[tuple[str, tuple[str, ...]], gymnasium.Env] = {}
 
 
-def make_env(name: str, arguments: tuple[str, ...] = ()) -> gymnasium.Env:
+def make_env(name: str, arguments: tuple[str, ...] = (), **more: Any) -> gymnasium.Env:
     """The environment that Gymnasium knows as `name`, opened once.
 
-    `arguments` are its constructor's, as `port=/dev/ttyACM0`: JSON on the right, or else text. Raises what Gymnasium or
-    the constructor raises.
+    `arguments` are its constructor's, as `port=/dev/ttyACM0`: JSON on the right, or else text; `more` are others, if it
+    is not open yet. Raises what Gymnasium or the constructor raises.
     """
     if (name, arguments) not in _opened:
         pairs = (argument.partition("=") for argument in arguments)
         given: Any = {key: _value(text) for key, _, text in pairs}
-        _opened[name, arguments] = gymnasium.make(name, disable_env_checker=True, **given)
+        _opened[name, arguments] = gymnasium.make(name, disable_env_checker=True, **(given | more))
     return _opened[name, arguments]
+
+
+def render_modes(name: str) -> Sequence[str] | None:
+    """How the environment says that it renders, without opening it; None where only an open one can tell."""
+    entry = gymnasium.spec(name.rpartition(":")[2]).entry_point
+    creator: Any = load_env_creator(entry) if isinstance(entry, str) else entry
+    return getattr(creator, "metadata", {}).get("render_modes")
+
+
+def picture(env: gymnasium.Env) -> np.ndarray:
+    """What an environment renders now [height, width, 3], 8-bit colors. Raises ValueError where that is no picture."""
+    drawn: Any = env.render()
+    if not isinstance(drawn, np.ndarray) or drawn.shape[2:] != (3,) or drawn.dtype != np.uint8:
+        what = f"an array of {drawn.dtype} {drawn.shape}" if isinstance(drawn, np.ndarray) else type(drawn).__name__
+        raise ValueError(f"its render returned {what}; expected uint8 [height, width, 3]")
+    return drawn
 
 
 def close_env(name: str, arguments: tuple[str, ...] = ()) -> None:
@@ -95,9 +115,12 @@ def env_spec(
     start_mean: Sequence[float] = (),
     start_std: Sequence[float] = (),
     starts: Sequence[Sequence[float]] = (),
+    state_names: Sequence[str] = (),
+    control_names: Sequence[str] = (),
 ) -> EnvSpec:
     """What is given of an environment, and the rest from itself; without `starts` or their mean it is reset 100 times.
 
+    Its attributes `dt`, `state_names` and `control_names` are asked for, those of its outermost wrapper that has them.
     Raises ValueError, in one line, when its controls or observations are not vectors of numbers, or cannot be as given.
     """
     env = make_env(name, arguments)
@@ -117,6 +140,8 @@ def env_spec(
                 f"controls from {least:g} to {greatest:g} are not among its own, from {bottom:g} to {top:g}"
             )
     size, rest = seen.shape[0], np.zeros(seen.shape)
+    states = named(env, "state_names", state_names, size)
+    actions = named(env, "control_names", control_names, controls.shape[0])
     mean, std = filled("start_mean", start_mean, size, rest, each=True), filled("start_std", start_std, size, rest)
     if not len(start_mean) and not len(starts):
         starts = [row.tolist() for row in resets_of(name, arguments)]
@@ -126,7 +151,24 @@ def env_spec(
     if len(places):
         mean, std = places.mean(0), places.std(0)
     limit = env.spec.max_episode_steps if env.spec else None
-    return EnvSpec(low, high, dt or period(env), horizon or limit or 100, mean, std, places)
+    return EnvSpec(low, high, dt or period(env), horizon or limit or 100, mean, std, places, states, actions)
+
+
+def named(env: Any, what: str, given: Sequence[str], size: int) -> tuple[str, ...]:
+    """The names given, or the environment's own; none where it has none. Raises ValueError for those that cannot be."""
+    try:
+        names = given or env.get_wrapper_attr(what)
+    except AttributeError:
+        return ()
+    if isinstance(names, str) or not all(
+        isinstance(name, str) and name.strip() and name.isprintable() for name in names
+    ):
+        raise ValueError(f"its {what} are {names!r}, not a tuple of texts such as 'angle [rad]'; or give {what}=")
+    if len(names) != size:
+        raise ValueError(f"{what} has {len(names)} entries, {', '.join(names)}; expected {size}")
+    if twice := [name for i, name in enumerate(names) if name in names[:i]]:
+        raise ValueError(f"{what} has {twice[0]} twice; each entry needs a name of its own")
+    return tuple(names)
 
 
 def period(env: Any) -> float:
@@ -141,15 +183,15 @@ def period(env: Any) -> float:
     return float(dt)
 
 
-def env_plant(name: str, arguments: tuple[str, ...], states: int) -> EnvPlant:
-    """The environment of so many observations, opened when its first episode begins.
+def env_plant(name: str, arguments: tuple[str, ...], states: int, names: tuple[str, ...] = ()) -> EnvPlant:
+    """The environment of so many observations, maybe with names, opened when its first episode begins.
 
     An observation that is not finite, or not of that length, is refused at once: no control follows from it, and no
     data. Controls are the environment's own copy, of its action space's dtype and limits; whole numbers are rounded.
     """
 
     def reset(seed: int) -> np.ndarray:
-        return observed(first(make_env(name, arguments).reset(seed=seed)), states)
+        return observed(first(make_env(name, arguments).reset(seed=seed)), states, names)
 
     def step(control: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
         env = make_env(name, arguments)
@@ -162,7 +204,7 @@ def env_plant(name: str, arguments: tuple[str, ...], states: int) -> EnvPlant:
                 f"its step returned {_shape(answer)}; expected (observation, reward, terminated, truncated, info)"
             )
         seen, _, terminated, truncated, _ = answer
-        return observed(seen, states), sent, "terminated" if terminated else "truncated" if truncated else ""
+        return observed(seen, states, names), sent, "terminated" if terminated else "truncated" if truncated else ""
 
     return EnvPlant(reset, step, lambda: close_env(name, arguments))
 
@@ -174,7 +216,7 @@ def first(answer: Any) -> Any:
     return answer[0]
 
 
-def observed(x: Any, states: int) -> np.ndarray:
+def observed(x: Any, states: int, names: Sequence[str] = ()) -> np.ndarray:
     """A copy of an observation [D], in single precision. Raises ValueError where it is not one, or not finite."""
     try:
         x = np.array(x, np.float32)
@@ -183,7 +225,8 @@ def observed(x: Any, states: int) -> np.ndarray:
     if x.shape != (states,):
         raise ValueError(f"it observed an array of shape {x.shape}; expected ({states},)")
     for entry in np.flatnonzero(~np.isfinite(x)):
-        raise ValueError(f"entry {entry} of its observation is {x[entry]}")
+        called = f", {names[int(entry)]}," if names else ""
+        raise ValueError(f"entry {entry} of its observation{called} is {x[entry]}")
     return x
 
 

@@ -6,6 +6,7 @@
 import os
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from importlib import import_module
 from typing import Any, Protocol
 
@@ -41,6 +42,15 @@ def graphics_context(width: int, height: int) -> Any:
             failures.append(f"{name}: {error or type(error).__name__}")
             _forget(set(sys.modules) - before, platform)
     raise RuntimeError("\n  ".join([_ADVICE, *failures]))
+
+
+def without_display() -> None:
+    """Set MUJOCO_GL, unless it is set, to what draws here without a display: Gymnasium would take a window's."""
+    if "MUJOCO_GL" not in os.environ:
+        with suppress(RuntimeError):  # whoever draws then says it better
+            context = graphics_context(16, 16)
+            context.free()
+            os.environ["MUJOCO_GL"] = type(context).__module__.rpartition(".")[2]
 
 
 def _forget(modules: set[str], platform: str | None) -> None:

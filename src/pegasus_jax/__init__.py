@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from pegasus_jax.learn.search import searcher as searcher
     from pegasus_jax.math import angles as angles
     from pegasus_jax.math import gaussian as gaussian
+    from pegasus_jax.math.delays import Delay as Delay
+    from pegasus_jax.math.delays import delay_of as delay_of
     from pegasus_jax.models import dropout as dropouts  # noqa: F401
     from pegasus_jax.models.bnn import bnn as bnn
     from pegasus_jax.models.ensemble import ensemble as ensemble
@@ -93,6 +95,7 @@ _NAMES = {
     "checks": "ConfigError RunError",
     "runs.controller": "controller Controller",
     "exports.write": "export",
+    "math.delays": "delay_of Delay",
     "episode": "Episode",
     # the method, function by function
     "imagine.scenarios": "blocks Blocks draw sampler Sampler",

@@ -334,6 +334,12 @@ class Config:
     env_args: tuple[str, ...] = setting(
         (), "the environment's own arguments, each as env_args.port=/dev/ttyACM0", (GYM,)
     )
+    state_names: tuple[str, ...] = setting(
+        (),
+        """of the observation, as '["angle [rad]","rate [rad/s]"]'; []: the environment's own, or x0, x1, ...""",
+        (GYM,),
+    )
+    control_names: tuple[str, ...] = setting((), "of the controls; []: the environment's own, or u0, u1, ...", (GYM,))
     stop: str | Callable | None = setting(  # noqa: RUF009 (frozen)
         None, "module:function, observation [D] -> probability that an episode ends there, in JAX", OWN
     )

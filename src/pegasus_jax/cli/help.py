@@ -83,6 +83,7 @@ bootstrap interval.
 PLAY = """\
 pegasus-play RUN [trial=last] [episodes=1] [seed=0]     film a learned policy on its plant
 
+Drives the run's environment, which is opened with render_mode="rgb_array", or simulates its plant.
 Writes RUN/play.mp4: fresh episodes of the newest whole checkpoint of the run, finished or not, in real time,
 20 pictures a second, with cost and command drawn below as they come about. Another seed= gives other starts and
 other noise. No display is needed: OpenGL comes from EGL or OSMesa, and MUJOCO_GL=egl|osmesa|glfw chooses; without

@@ -2,6 +2,7 @@
 
 import gc
 import runpy
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -72,6 +73,7 @@ def drives(
     limit = max(0.5, 5 * task.dt) if watchdog is None else watchdog
     check_range("watchdog", limit, task.dt, open_low=True)
     task = task._replace(horizon=task.horizon if seconds is None else max(1, round(seconds / task.dt)))
+    print(_announced(task, int(state.trial), limit), file=sys.stderr)
     with tempfile.TemporaryDirectory() as folder:
         control = runpy.run_path(str(export(run, int(state.trial), out=Path(folder) / "policy.py")))["Controller"]()
     gc.freeze()  # nothing that is there is looked at by the garbage collector while the robot moves
@@ -84,6 +86,14 @@ def drives(
     finally:
         tasks.close(task)
         gc.unfreeze()
+
+
+def _announced(task: Task, trial: int, limit: float) -> str:
+    """What will drive, before it does."""
+    limits = zip(task.control_names, task.control_low, task.control_high, strict=True)
+    sent = ", ".join(f"{name} from {low:g} to {high:g}" for name, low, high in limits)
+    period = f"every {task.dt:g} s for {task.horizon * task.dt:g} s, watchdog {limit:g} s"
+    return f"the policy of trial {trial} drives {task.name}: {', '.join(task.state_names)} -> {sent}; {period}"
 
 
 def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy: int, seed: int, limit: float) -> Drive:

@@ -37,7 +37,9 @@ class Learned(NamedTuple):
 
     @property
     def observation(self) -> tuple[str, ...]:
-        """Names of the entries of an observation [O]; those of a cosine and a sine are x0, x1, ..."""
+        """Names of the entries of an observation [O]; without any, a cosine and a sine are x0, x1, ..."""
+        if names := self.config.state_names:
+            return tuple(names[i] for i in self.config.sensors.measured or range(len(names)))
         task, measured = self.task, recall.measured(self.task)
         size = len(measured) + len(task.circles)
         kept = dict(zip(entries(size, task.circles), (task.state_names[i] for i in measured), strict=True))

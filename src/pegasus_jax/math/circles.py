@@ -49,11 +49,12 @@ def places(of: Sequence[int], size: int, circles: Circles) -> tuple[int, ...]:
     return tuple(kept.index(entry) for entry in of)
 
 
-def names(size: int, circles: Circles) -> tuple[str, ...]:
-    """Names of the state's entries: those of the observation are x0, x1, ..."""
+def names(observed: Sequence[str], circles: Circles) -> tuple[str, ...]:
+    """Names of the state's entries, of those of the observation."""
     pair_at = _pair_at(circles)
     return tuple(
-        f"atan2(x{pair_at[i][1]}, x{pair_at[i][0]})" if i in pair_at else f"x{i}" for i in entries(size, circles)
+        f"atan2({observed[pair_at[i][1]]}, {observed[pair_at[i][0]]})" if i in pair_at else observed[i]
+        for i in entries(len(observed), circles)
     )
 
 

@@ -40,14 +40,15 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)
-    return [*notes, *plausible(readings, facts), *alike(readings, task.angles, task.state_names)]
+    return [*notes, *plausible(readings, facts, task.state_names), *alike(readings, task.angles, task.state_names)]
 
 
 def circles_found(given: Config, known: Config) -> list[str]:
     """The note that pairs of cosines and sines were found, where the user said nothing of them: one line, or none."""
     if given.circles is not None or not known.circles:
         return []
-    pairs = ", and ".join(f"x{cosine} and x{sine} are cosine and sine of one angle" for cosine, sine in known.circles)
+    called = known.state_names or tuple(f"x{i}" for i in range(len(known.start_mean)))
+    pairs = ", and ".join(f"{called[c]} and {called[s]} are cosine and sine of one angle" for c, s in known.circles)
     found = f"circles={shown(known.circles)} found: {pairs}, which is learned instead of them"
     return [f"{found}; cost= still gets the observation; circles=[] switches this off"]
 
@@ -67,17 +68,17 @@ def stopping(config: Config, task: Task) -> None:
         raise ConfigError(f"{what} is {float(value):g} at the start: every episode would end there")
 
 
-def plausible(readings: np.ndarray, facts: cost_check.Facts) -> list[str]:
+def plausible(readings: np.ndarray, facts: cost_check.Facts, names: tuple[str, ...]) -> list[str]:
     """Notes on angles that are large for radians. Raises ConfigError for those that must be degrees.
 
-    readings: [N, D] of resets
+    readings: [N, D] of resets; names: [D] of the entries
     """
     notes = []
     for entry in facts.angles:
         seen = [*readings[:, entry], facts.start_mean[entry]]
         largest = float(max(seen, key=abs))
         theirs = entries(len(facts.start_mean) + len(facts.circles), facts.circles)[entry]
-        text = f"angles=[{theirs}]: x{theirs} is {largest:.4g} at the start"
+        text = f"angles=[{theirs}]: {names[entry]} is {largest:.4g} at the start"
         if abs(largest) > 4 * np.pi:
             raise ConfigError(f"{text}, more than two turns in radians; degrees? Return np.deg2rad of it")
         if abs(largest) > 2 * np.pi:

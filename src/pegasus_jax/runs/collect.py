@@ -85,13 +85,13 @@ def costed(job: Job, ran: Episode, trial: int) -> Episode:
     return ran._replace(trajectory=ran.trajectory._replace(cost=cost))
 
 
-def failed(ran: Episode, task: Task, advice: str = "") -> None:
+def failed(ran: Episode, task: Task, advice: str = "", kept: bool = True) -> None:
     """Raise what ended an episode on an environment before its time: RunError in one line, or the signal itself."""
     if isinstance(ran.error, KeyboardInterrupt):
         raise ran.error
     if ran.error is not None:
-        kept = f"; its {len(ran.trajectory.u)} rows are kept" if len(ran.trajectory.u) else ""
-        raise RunError(f"{task.name} failed in an episode, {user_code.told(ran.error)}{kept}{advice}") from ran.error
+        rows = f"; its {len(ran.trajectory.u)} rows are kept" if kept and len(ran.trajectory.u) else ""
+        raise RunError(f"{task.name} failed in an episode, {user_code.told(ran.error)}{rows}{advice}") from ran.error
 
 
 def stacked(episodes: list[Episode], task: Task) -> Trajectory:

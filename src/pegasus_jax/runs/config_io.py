@@ -202,7 +202,8 @@ def _value(key: str, text: str) -> Any:
     try:
         return OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]))["value"]  # type: ignore[index,call-overload]
     except Exception as error:
-        raise ConfigError(f"{key}={shown(text)} cannot be read as a value") from error
+        quoted = f'; quote what has spaces or brackets, as in \'{key}=["a [m]","b"]\'' if "[" in text else ""
+        raise ConfigError(f"{key}={shown(text)} cannot be read as a value{quoted}") from error
 
 
 def _changed(node: Any, changes: dict[str, Any], prefix: str) -> Any:

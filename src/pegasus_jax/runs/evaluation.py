@@ -33,7 +33,7 @@ def driven(keys: Key, params: Params, task: Task, program: Program) -> np.ndarra
     costs = []
     for some in jnp.swapaxes(keys, 0, 1):
         for ran in program.collect(some, params, False, purpose="evaluate"):
-            failed(ran, task)
+            failed(ran, task, kept=False)
             costs.append(episode.charged(ran.trajectory.cost, task))
     return np.reshape(costs, (keys.shape[1], keys.shape[0], task.horizon)).swapaxes(0, 1)
 

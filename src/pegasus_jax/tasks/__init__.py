@@ -162,16 +162,17 @@ def from_gym(config: Config) -> Task:
 
     _complete(config)
     known: dict[str, Any] = {name: getattr(config, name) for name in EnvSpec._fields}
-    if any(value in (None, ()) for name, value in known.items() if name != "starts"):
+    names = {"state_names", "control_names"}
+    if any(value in (None, ()) for name, value in known.items() if name not in {"starts", *names}):
         return from_gym(resolve(config))
-    known |= {name: np.array(value, float) for name, value in known.items() if isinstance(value, tuple)}
+    known |= {n: np.array(value, float) for n, value in known.items() if isinstance(value, tuple) and n not in names}
     name, about = config.env or "", EnvSpec(**known)
-    states = tuple(f"x{i}" for i in range(len(about.start_mean)))
-    controls = tuple(f"u{i}" for i in range(len(about.control_low)))
+    states = about.state_names or tuple(f"x{i}" for i in range(len(about.start_mean)))
+    controls = about.control_names or tuple(f"u{i}" for i in range(len(about.control_low)))
     task = _of_users(config, name, None, about, about.horizon, states, controls)
     task = task._replace(
         rates=_entries("rates", config.rates, name, len(states)),
-        environment=env_plant(name, config.env_args, len(states)),
+        environment=env_plant(name, config.env_args, len(states), about.state_names),
         starts=about.starts if len(about.starts) else None,
     )
     return circled.start_moments(circled.of_angles(*sensed.chosen(task, config.sensors.measured, config.circles or ())))
@@ -250,8 +251,11 @@ def described(config: Config) -> dict[str, str]:
     }
 
 
-def environment(config: Config) -> Any:
-    """The environment of a config, opened once a process. Raises ConfigError, in one line, where it cannot be made."""
+def environment(config: Config, **more: Any) -> Any:
+    """The environment of a config, opened once a process; `more` arguments are for one that is not open yet.
+
+    Raises ConfigError, in one line, where it cannot be made.
+    """
     import gymnasium
 
     from pegasus_envs.gym_plant import make_env
@@ -260,7 +264,7 @@ def environment(config: Config) -> Any:
     if name:
         user_code.importing(f"env={config.env}", name)
     try:
-        return make_env(config.env or "", config.env_args)
+        return make_env(config.env or "", config.env_args, **more)
     except (gymnasium.error.Error, ModuleNotFoundError) as error:
         raise ConfigError(f"env={config.env}: {str(error).splitlines()[0]}") from error
     except KeyboardInterrupt:
@@ -340,6 +344,29 @@ def _entries(setting: str, entries: tuple[int, ...], name: str, states: int) -> 
                 f"{setting}={entry} is not an entry of {name}'s observation; choose from 0 to {states - 1}"
             )
     return entries
+
+
+def camera(config: Config) -> Callable[[], np.ndarray]:
+    """Open the environment of a config so that it renders; each call is a picture [height, width, 3] of 8-bit colors.
+
+    Raises ConfigError, in one line, for one that cannot; where it says so itself, before it is opened.
+    """
+    from pegasus_envs.gym_plant import close_env, picture, render_modes
+    from pegasus_envs.render import without_display
+
+    without_display()
+    refusal = f"env={config.env} cannot be filmed: 'rgb_array' is not among its metadata's render_modes"
+    if config.env and ":" in config.env:
+        user_code.importing(f"env={config.env}", config.env.rpartition(":")[0])
+    with user_code.blamed(f"env={config.env}"):
+        known = render_modes(config.env or "")
+    if known is not None and "rgb_array" not in known:
+        raise ConfigError(f"{refusal}, {list(known)}")
+    interrupt.let_go(lambda: close_env(config.env or "", config.env_args))
+    env = environment(config, render_mode="rgb_array")
+    if "rgb_array" not in (env.metadata or {}).get("render_modes", ()):
+        raise ConfigError(refusal)
+    return lambda: picture(env)
 
 
 def pictures(task: Task, states: Any, width: int, height: int) -> list[np.ndarray]:

@@ -36,7 +36,7 @@ def of_angles(task: Task, circles: pairs.Circles) -> Task:
         start_std=spread(task.start_mean, task.start_std, circles),
         starts=None if task.starts is None else pairs.to_state(np.asarray(task.starts, float), circles),
         sensor_std=np.zeros(size - len(circles)),
-        state_names=pairs.names(size, circles),
+        state_names=pairs.names(task.state_names, circles),
         circles=circles,
     )
 

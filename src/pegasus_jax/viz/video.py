@@ -1,7 +1,9 @@
 """A film of a run's newest policy on its plant, with cost and command drawn below as they come about."""
 
 import os
+from collections.abc import Callable, Iterator
 from functools import partial
+from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -14,16 +16,21 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image, ImageOps
 
 from pegasus_jax import episode, tasks
+from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import RunError
+from pegasus_jax.config import Config
 from pegasus_jax.runs import restore
+from pegasus_jax.runs.collect import failed
 from pegasus_jax.types import Array, Key, Params, Policy, Task, Trajectory
 
 WIDTH, HEIGHT, STRIP = 640, 480, 192  # [pixels], multiples of the 16 of a video's blocks
 COST, CURSOR = "#d1495b", np.array([40, 40, 40], np.uint8)
 os.environ.setdefault("IMAGEIO_FFMPEG_NO_PREVENT_SIGINT", "1")  # else it forks by hand, which JAX's threads forbid
 
+EVERY = 0.04  # from one picture of an environment to the next at least [s]
 COMING = 0.15  # how much is seen of what is yet to come
 
 
@@ -38,26 +45,31 @@ class Strip(NamedTuple):
 
 
 def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.LAST, mjcf: str | None = None) -> Path:
-    """Write RUN/play.mp4: `episodes` episodes that are not data, one after the other, in real time."""
-    _, experiment, state = restore.ready(run, trial, mjcf)
-    task = experiment.task
-    if task.plant is None:
-        raise RunError(f"{run} learned {task.name}; only plants in JAX can be filmed")
-    perform = jax.jit(partial(performance, task=task, policy=experiment.policy))
+    """Write RUN/play.mp4: `episodes` episodes that are not data, one after the other, in real time.
+
+    An environment is opened for it with render_mode="rgb_array". Raises ConfigError for one that does not render.
+    """
+    config, experiment, state = restore.ready(run, trial, mjcf)
+    task, number = experiment.task, int(state.trial)
+    if task.environment is None:
+        perform = jax.jit(partial(performance, task=task, policy=experiment.policy))
+        keys = jax.random.split(jax.random.key(seed), episodes)
+        played = ((ran, pictures(task, states)) for ran, states in (perform(key, state.policy.params) for key in keys))
+    else:
+        played = driven(config, state.policy.params, range(seed, seed + episodes))
     path, writer = run / "play.mp4", None
     # A folder of its own beside: ffmpeg opens no file that was there, and what was at `path`, a link too, is replaced.
     with TemporaryDirectory(dir=run, prefix=".play.") as folder:
         beside = Path(folder) / path.name
         try:
-            for number, key in enumerate(jax.random.split(jax.random.key(seed), episodes), start=1):
-                trajectory, states = perform(key, state.policy.params)
-                title = f"{task.name}, trial {int(state.trial)}, episode {number} of {episodes}"
-                drawn = pictures(task, states)
+            for place, (trajectory, drawn) in enumerate(played, start=1):
+                title = f"{task.name}, trial {number}, episode {place} of {episodes}"
                 if writer is None:
-                    writer = _writer(beside, rate=round(len(drawn) / (task.horizon * task.dt)))
+                    writer = _writer(beside, rate=max(1, round(len(drawn) / (len(trajectory.u) * task.dt))))
                 for picture in composed(drawn, strip(trajectory, task, title)):
                     writer.append_data(picture)
         finally:
+            tasks.close(task)
             if writer is not None:
                 writer.close()
         os.replace(beside, path)
@@ -73,9 +85,42 @@ def performance(key: Key, params: Params, *, task: Task, policy: Policy) -> tupl
     return episode.run_with_trace(key, act, task, task.plant.substates)
 
 
+def driven(config: Config, params: Params, seeds: range) -> Iterator[tuple[Trajectory, list[np.ndarray]]]:
+    """One episode a seed on a config's environment, and its pictures on the way, at most one each `EVERY` seconds.
+
+    Raises ConfigError for an environment that does not render, RunError where an episode, or its rendering, failed.
+    """
+    task, look, drawn = tasks.of_config(config), tasks.camera(config), list[np.ndarray]()
+    watched = task._replace(environment=filmed(task.environment, look, max(1, round(EVERY / task.dt)), drawn))
+    drive: Any = compose(config, watched).drive
+    for seed in seeds:
+        drawn.clear()
+        ran = drive(jax.random.key(seed), params, False)
+        failed(ran, task, kept=False)
+        yield ran.trajectory, [*drawn] or [fitted(look())]
+
+
+def filmed(environment: Any, look: Callable[[], np.ndarray], every: int, drawn: list[np.ndarray]) -> Any:
+    """The environment, of which a picture is added to `drawn` after every so many steps, and where it ends early."""
+    steps = count(1)
+
+    def step(u: np.ndarray) -> tuple[Any, ...]:
+        answer = environment.step(u)
+        if next(steps) % every == 0 or answer[2]:
+            drawn.append(fitted(look()))
+        return answer
+
+    return environment._replace(step=step)
+
+
+def fitted(picture: np.ndarray) -> np.ndarray:
+    """A picture of any size as one [HEIGHT, WIDTH, 3]: as large as it can be, black beside it."""
+    return np.asarray(ImageOps.pad(Image.fromarray(picture), (WIDTH, HEIGHT)))
+
+
 def strip(trajectory: Trajectory, task: Task, title: str) -> Strip:
     """Draw an episode's cost and command; a control is held for its period, at whose end the cost is counted."""
-    times = task.dt * np.arange(task.horizon + 1)
+    times = task.dt * np.arange(len(trajectory.u) + 1)
     cost, u = np.asarray(trajectory.cost), np.asarray(trajectory.u)
     low, high = np.asarray(task.control_low), np.asarray(task.control_high)
     units = {name.rpartition(" ")[2] for name in task.control_names}

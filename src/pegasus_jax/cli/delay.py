@@ -1,0 +1,56 @@
+"""The command pegasus-delay: how many periods pass from a control to what is observed of it."""
+
+from collections.abc import Sequence
+
+from pegasus_jax.checks import ConfigError, whole
+from pegasus_jax.cli.main import main
+
+DELAY = """\
+pegasus-delay env=ID [amplitude=0.1] [periods=200] [setting=value ...]     measure the delay of a robot. It moves!
+
+Drives the environment by random controls, small ones, and says after how many control periods the first change is
+observed: of the motor's driver, the wires, the sensors and their filters together. Takes the words of pegasus-train
+besides; env_args.*, angles=, dt=, control_low= and control_high= are of use, and no cost is needed. Nothing is written.
+
+  amplitude=0.1         of the controls, as a fraction of half their range, above and below rest: 0, or the limit next
+                        to it. Each period has the one or the other. Too small, and no change is found
+  periods=200           control periods to drive, in several episodes if horizon= is less; each ends with one at rest
+  most=8                the greatest delay that is looked for
+
+A delay of 0 periods is the usual one of a simulation: a control changes what is read at the end of its own period.
+With sensors.delay=D pegasus-train learns with that delay.
+
+examples
+  pegasus-delay env=robot:Arm-v0 angles=[0]
+  pegasus-delay env=robot:Arm-v0 angles=[0] amplitude=0.2 periods=400 control_low=[-1] control_high=[1]
+"""
+
+
+def delay() -> None:
+    """Entry point of pegasus-delay."""
+    main(handle, DELAY, stopped="the environment is closed")
+
+
+def handle(words: Sequence[str]) -> None:
+    """Measure, and say what was found. Raises ConfigError for words that cannot be."""
+    from pegasus_jax.runs import config_io
+
+    options, rest = config_io.split(words, ("amplitude", "periods", "most"))
+    amplitude = _number("amplitude", options.get("amplitude", "0.1"))
+    periods, most = (whole(name, options.get(name, default)) for name, default in (("periods", "200"), ("most", "8")))
+    config = config_io.parse({"task": "gym", **rest}, options=("amplitude", "periods", "most"))
+    from pegasus_jax.runs.delay import measure, told
+
+    print(told(measure(config, amplitude, periods, most)))
+
+
+def _number(name: str, text: str) -> float:
+    """The number of an option. Raises ConfigError for what is none."""
+    try:
+        return float(text)
+    except ValueError as error:
+        raise ConfigError(f"{name}={text} is not a number; for example {name}=0.1") from error
+
+
+if __name__ == "__main__":
+    delay()

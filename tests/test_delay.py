@@ -1,0 +1,183 @@
+"""pegasus-delay: the delay that a plant has is the one that is found, and how sure that is; the robot ends at rest."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+
+from pegasus_jax import tasks
+from pegasus_jax.checks import ConfigError, RunError
+from pegasus_jax.cli.delay import handle
+from pegasus_jax.math.delays import delay_of
+from pegasus_jax.runs import config_io
+from pegasus_jax.runs.delay import measure, told
+
+
+class Late(gymnasium.ActionWrapper):
+    """The cart-pole of pegasus_envs, driven by the control of so many periods ago, maybe with only positions read."""
+
+    def __init__(self, delay: int = 0, positions: bool = False):
+        super().__init__(gymnasium.make("pegasus_envs:pegasus/CartPoleSwingUp-v0"))
+        self.delay, self.entries = delay, [0, 3] if positions else [0, 1, 2, 3]
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (len(self.entries),))
+        self.state_names = tuple(self.env.get_wrapper_attr("state_names")[i] for i in self.entries)
+
+    def reset(self, **options: Any) -> Any:
+        self.queue = deque([np.zeros(1, np.float32)] * self.delay)
+        x, info = self.env.reset(**options)
+        return x[self.entries], info
+
+    def step(self, action: Any) -> Any:
+        self.queue.append(action)
+        x, *rest = self.env.step(self.queue.popleft())
+        return x[self.entries], *rest
+
+
+class Motor(gymnasium.Env):
+    """A rate that the control drives, at a quantized angle; the last control is read too. What it was sent is kept."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+    action_space = gymnasium.spaces.Box(-1.0, 3.0, (1,))
+    dt, state_names = 0.02, ("angle [rad]", "last volts [V]")
+    sent: list[float] = []  # noqa: RUF012
+    closed = 0
+
+    def __init__(self, gain: float = 1.0, fails: int = -1, falls: int = -1):
+        self.gain, self.fails, self.falls = gain, fails, falls
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        super().reset(seed=seed)
+        self.angle, self.rate, self.late, self.count = 0.0, 0.0, 0.0, 0
+        return np.zeros(2), {}
+
+    def step(self, control: Any) -> Any:
+        self.count += 1
+        if self.count == self.fails:
+            raise OSError("no motor answers")
+        Motor.sent.append(float(control[0]))
+        self.rate += self.gain * self.late - 0.1 * self.rate + 0.01 * self.np_random.normal()
+        self.late, self.angle = float(control[0]), self.angle + self.rate
+        return np.array([round(self.angle, 1), control[0]]), 0.0, self.count == self.falls, False, {}
+
+    def close(self) -> None:
+        Motor.closed += 1
+
+
+for name, kind in (("Late-v0", Late), ("Motor-v0", Motor)):
+    gymnasium.register(name, kind)
+
+
+@pytest.fixture(autouse=True)
+def fresh() -> Any:
+    Motor.sent.clear()
+    Motor.closed = 0
+    yield
+    tasks.close_environments()
+
+
+def config(**words: str) -> Any:
+    return config_io.parse({"task": "gym", **words})
+
+
+@pytest.mark.parametrize("positions", [False, True])
+@pytest.mark.parametrize("delay", [0, 1, 2])
+def test_the_delay_of_a_cart_pole_is_found(delay: int, positions: bool) -> None:
+    given = {"env_args.delay": str(delay), "env_args.positions": str(positions).lower()}
+    angle = "[1]" if positions else "[3]"
+    found = measure(config(env="Late-v0", angles=angle, horizon="25", **given), amplitude=0.2)
+    assert found.delay.periods == delay
+    assert found.delay.probabilities[delay] > 0.7
+    assert found.delay.probabilities.sum() == pytest.approx(1)
+    line = told(found)
+    assert line.startswith(f"Late-v0: delay {delay} {'period' if delay == 1 else 'periods'}, {0.1 * delay:g} s (")
+    assert line.endswith(f"; give sensors.delay={delay}" if delay else "; no sensors.delay= is needed")
+
+
+def test_a_motor_is_moved_a_little_and_ends_at_rest() -> None:
+    """Its limits are -1 and 3; the last control, which it reads, is no proof of a delay of 0."""
+    found = measure(config(env="Motor-v0", horizon="60"), amplitude=0.1, periods=100)
+    assert {*np.round(Motor.sent, 6)} == {-0.2, 0.2, 0.0}
+    ends = [Motor.sent[60], Motor.sent[-1]]
+    assert (len(Motor.sent), ends, Motor.sent.count(0.0), Motor.closed) == (101, [0.0, 0.0], 2, 1)
+    assert (found.delay.periods, found.delay.echoes, found.delay.rows) == (1, (1,), 101 - 2 * 8)
+    assert told(found).endswith("; give sensors.delay=1; not looked at, because it repeats a control: last volts [V]")
+
+
+def test_where_nothing_answers_it_says_so() -> None:
+    line = told(measure(config(env="Motor-v0", **{"env_args.gain": "0"}), amplitude=0.1))
+    assert "no change follows from the controls in " in line
+    assert "the nearest is amplitude=0.2" in line
+
+
+def test_noise_alone_has_no_delay() -> None:
+    """By chance one in some hundred tries would be allowed."""
+    draw = np.random.default_rng(0)
+    walks = [(np.cumsum(draw.normal(size=(151, 3)), 0), draw.choice([-1.0, 1.0], (150, 1))) for _ in range(50)]
+    assert sum(delay_of([walk]).periods is not None for walk in walks) <= 1
+    still = delay_of([(np.zeros((151, 2)), walks[0][1])])
+    assert still.periods is None
+
+
+def test_an_answer_that_is_drowned_by_noise_is_less_sure() -> None:
+    """A delay of 2 in sensors whose noise grows: the probability of the truth falls, that of nothing rises."""
+    draw, stds = np.random.default_rng(1), (0.01, 3.0, 30.0)
+    chances = np.zeros((3, 10))
+    for _ in range(20):
+        u = draw.choice([-1.0, 1.0], (300, 1))
+        x = np.cumsum(np.concatenate([np.zeros((3, 1)), u[:-2]]), 0)
+        chances += [delay_of([(x + std * draw.normal(size=x.shape), u)]).probabilities / 20 for std in stds]
+    truth, nothing = chances[:, 2], chances[:, -1]
+    assert truth[0] > 0.8
+    assert nothing[0] < 1e-6
+    assert nothing[2] > 0.8
+    assert (np.diff(truth) < 0).all()
+    assert (np.diff(nothing) > 0).all()
+
+
+def test_an_angle_may_pass_half_a_turn() -> None:
+    draw = np.random.default_rng(2)
+    u = draw.choice([-1.0, 1.0], (200, 2))
+    angle = (
+        np.pi + np.cumsum(np.concatenate([np.zeros((2, 1)), 0.3 * u[:-1, 1:]]), 0) + 0.01 * draw.normal(size=(201, 1))
+    )
+    wrapped = np.angle(np.exp(1j * angle))
+    assert delay_of([(wrapped, u)], angles=[0]).probabilities[1] > 0.99
+
+
+def test_what_cannot_be_is_one_line_and_moves_nothing() -> None:
+    for words, complaint in (
+        (["env=Motor-v0", "amplitude=0"], r"amplitude=0 is out of range; expected a number in \(0, 1\]"),
+        (["env=Motor-v0", "amplitude=some"], "amplitude=some is not a number; for example amplitude=0.1"),
+        (["env=Motor-v0", "periods=60"], r"periods=60 is out of range; expected a number in \[67, 1000000\]"),
+        (["env=Motor-v0", "most=0"], "most=0 is out of range"),
+        (["env=Motor-v0", "ampltude=1"], "did you mean 'amplitude'"),
+        (["amplitude=0.1"], "pegasus-delay drives an environment; for example env=robot:Arm-v0"),
+        (["env=Motor-v9"], "env=Motor-v9: "),
+    ):
+        with pytest.raises(ConfigError, match=complaint) as refused:
+            handle(words)
+        assert "\n" not in str(refused.value)
+    assert Motor.sent == []
+
+
+def test_a_robot_that_fails_or_falls_is_closed() -> None:
+    with pytest.raises(RunError, match=r"Motor-v0 failed in an episode, OSError: no motor answers"):
+        measure(config(env="Motor-v0", **{"env_args.fails": "5"}))
+    with pytest.raises(
+        ConfigError, match=r"periods=200 in 20 episodes of Motor-v0: 0 rows .* are too few; 59 are enough"
+    ):
+        measure(config(env="Motor-v0", **{"env_args.falls": "5"}))
+    assert Motor.closed == 2
+
+
+def test_it_takes_the_words_of_a_run(capsys: pytest.CaptureFixture[str]) -> None:
+    """Of which those of learning are of no use, and harm nothing."""
+    handle(["env=Motor-v0", "cost=nowhere:cost", "start_mean=[0,0]", "control_high=[1]", "amplitude=0.5", "most=4"])
+    assert {*np.round(Motor.sent, 6)} == {-0.5, 0.5, 0.0}
+    assert capsys.readouterr().out.count("\n") == 1
+    assert dataclasses.asdict(config(env="Motor-v0"))["cost"] is None
