@@ -44,6 +44,7 @@ def of_task(task: Task) -> dict[str, Any]:
 def asked(task: Task) -> dict[str, Any]:
     """What a cost takes beside the state: names, a reference as its values along an episode, the sizes of goals."""
     import jax
+    import jax.numpy as jnp
 
     from pegasus_jax.tasks.signals import times
     from pegasus_jax.tasks.terms import terms_of
@@ -53,7 +54,7 @@ def asked(task: Task) -> dict[str, Any]:
         return {}
     told: dict[str, Any] = {"terms": list(terms)}
     if task.reference is not None:
-        told["reference"] = np.asarray(jax.vmap(task.reference.value)(times(task)), float).tolist()
+        told["reference"] = np.asarray(jax.vmap(task.reference.value)(jnp.asarray(times(task))), float).tolist()
     if task.goal is not None:
         told["goal"] = list(task.goal.units)
     return told

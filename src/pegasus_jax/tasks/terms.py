@@ -163,9 +163,9 @@ def clock(task: Task, timed: bool) -> Memory:
     """
     begun, signal = recall.clock(task.dt), task.reference
     shown, units = ([CLOCK], [task.horizon * task.dt]) if timed else ([], [])
-    for ahead in AHEAD if signal is not None else ():
-        shown += reference_names(task, ahead)
-        units += signal.units
+    if signal is not None:
+        shown += [name for ahead in AHEAD for name in reference_names(task, ahead)]
+        units += signal.units * len(AHEAD)
 
     def show(m: Array, o: Array) -> Array:
         soon = [] if signal is None else [signal.value(m[0] + ahead * task.dt) for ahead in AHEAD]

@@ -94,15 +94,23 @@ def driven(config: Config, params: Params, seeds: range) -> Iterator[tuple[Traje
     watched = task._replace(environment=filmed(task.environment, look, max(1, round(EVERY / task.dt)), drawn))
     drive: Any = compose(config, watched).drive
     for seed in seeds:
-        drawn.clear()
         ran = drive(jax.random.key(seed), params, False)
         failed(ran, task, kept=False)
         yield ran.trajectory, [*drawn] or [fitted(look())]
 
 
 def filmed(environment: Any, look: Callable[[], np.ndarray], every: int, drawn: list[np.ndarray]) -> Any:
-    """The environment, of which a picture is added to `drawn` after every so many steps, and where it ends early."""
+    """The environment, of which a picture is added to `drawn` after every so many steps, and where it ends early.
+
+    A reset begins a film of its own: it empties `drawn`.
+    """
     steps = count(1)
+
+    def reset(seed: int) -> np.ndarray:
+        nonlocal steps
+        steps = count(1)
+        drawn.clear()
+        return environment.reset(seed)
 
     def step(u: np.ndarray) -> tuple[Any, ...]:
         answer = environment.step(u)
@@ -110,7 +118,7 @@ def filmed(environment: Any, look: Callable[[], np.ndarray], every: int, drawn: 
             drawn.append(fitted(look()))
         return answer
 
-    return environment._replace(step=step)
+    return environment._replace(reset=reset, step=step)
 
 
 def fitted(picture: np.ndarray) -> np.ndarray:
