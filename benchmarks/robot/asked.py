@@ -6,7 +6,7 @@ from pegasus_jax.types import Array
 
 POLE, WIDTH = 0.6, 0.25  # of the project's cart-pole [m]: the pole's length, and the width of its cost
 LARGEST = 10.0  # its force [N]
-EFFORT, RATE = 0.01, 0.1  # weights of the square of a control, and of its change, as fractions of the largest
+EFFORT, RATE = 0.01, 0.3  # weights of the square of a control, and of its change, as fractions of the largest
 
 
 def near(square: Array, width: float) -> Array:
