@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from pegasus_jax.types import Dataset as Dataset
     from pegasus_jax.types import Dropout as Dropout
     from pegasus_jax.types import Dynamics as Dynamics
+    from pegasus_jax.types import Hindsight as Hindsight
     from pegasus_jax.types import Memory as Memory
     from pegasus_jax.types import ModelLearner as ModelLearner
     from pegasus_jax.types import Period as Period
@@ -79,6 +80,7 @@ if TYPE_CHECKING:
     from pegasus_jax.types import Rollout as Rollout
     from pegasus_jax.types import RunState as RunState
     from pegasus_jax.types import Scenarios as Scenarios
+    from pegasus_jax.types import Signal as Signal
     from pegasus_jax.types import Task as Task
     from pegasus_jax.types import TrainState as TrainState
     from pegasus_jax.types import Trajectory as Trajectory
@@ -116,8 +118,8 @@ _NAMES = {
     "policies.wrap": "of_pair",
     "pilco.rbf": "rbf",
     # the values that pass between them
-    "types": "Task Cost Trajectory Dataset Batch Dynamics Prediction Dropout Policy Memory Scenarios Period Rollout"
-    " TrainState ModelLearner PolicyOptimizer RunState",
+    "types": "Task Cost Trajectory Dataset Batch Dynamics Prediction Dropout Policy Memory Hindsight Signal Scenarios"
+    " Period Rollout TrainState ModelLearner PolicyOptimizer RunState",
     "vectorized": "Vectorized",
 }
 # Families of functions, each a module under a name of its own: `pegasus_jax.costs.mean`.

@@ -19,13 +19,13 @@ from pegasus_jax.math import circles
 from pegasus_jax.tasks import circled, sensed, terms, user_code
 from pegasus_jax.tasks.signals import FILES, named, with_signals
 from pegasus_jax.tasks.starts import from_starts
-from pegasus_jax.tasks.terms import whole
+from pegasus_jax.tasks.terms import whole as whole
 from pegasus_jax.types import Cost, Task
 
 if TYPE_CHECKING:
     from pegasus_envs.plant import Plant
 
-__all__ = ["make", "of_config", "whole"]
+__all__ = ["make", "of_config"]
 
 
 def of_plant(name: str, plant: "Plant") -> Task:
