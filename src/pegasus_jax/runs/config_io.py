@@ -103,7 +103,11 @@ def _with_arguments(words: Mapping[str, Any]) -> dict[str, Any]:
 
 def values(words: Mapping[str, Any]) -> dict[str, Any]:
     """What the texts on the right of `key=` mean, read as YAML; what is no text is a value already."""
-    return {key: _value(key, text) if isinstance(text, str) else text for key, text in words.items()}
+    return {key: _value(key, text) if isinstance(text, str) else text for key, text in words.items()} | (
+        {"data": [name.strip() for name in words["data"].strip("[]").split(",") if name.strip()]}  # * is no YAML
+        if isinstance(words.get("data"), str)
+        else {}
+    )
 
 
 def override(config: Config, changes: dict[str, Any]) -> Config:
