@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from benchmarks.plants_suite.__main__ import on_core
+from benchmarks.plants_suite.__main__ import ONE_CORE, on_core
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import PROGRAM
 from pegasus_jax.runs import config_io
@@ -29,9 +29,9 @@ from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.study import SOLVED, first_solved, seed_list
 
 TASK = (
-    "task=gym env=robot:FurutaSafe-v0 cost=robot:cost angles=[1] start_mean=[0,0,0,0,0]"
-    " start_std=[0.02,0.02,0.01,0.01,0.01] horizon=100 eval_episodes=10"
-).split()
+    *("task=gym", "env=robot:FurutaSafe-v0", "cost=robot:cost", "angles=[1]", "horizon=100", "eval_episodes=10"),
+    *("start_mean=[0,0,0,0,0]", "start_std=[0.02,0.02,0.01,0.01,0.01]"),
+)
 KEPT = ("trial", "plant_seconds", "log_seconds", "policy", "episode_cost", "mean_cost", "success_rate", "seconds")
 
 
@@ -81,7 +81,7 @@ def main(given: list[str]) -> None:
     folder = Path(options.get("furuta", ".")).absolute()
     if not (folder / "robot.py").is_file():
         raise ConfigError(f"furuta={folder} has no robot.py")
-    os.environ["PYTHONPATH"] = os.pathsep.join([str(folder), os.environ.get("PYTHONPATH", "")])
+    ONE_CORE["PYTHONPATH"] += os.pathsep + str(folder)
     began, random = time.monotonic(), options.get("random") == "true"
     until = began + 60 * float(options.get("minutes", "9"))
     out, trials = Path(options.get("out", "runs/logs.json")).absolute(), int(options.get("trials", "10"))

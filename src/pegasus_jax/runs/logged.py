@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax.assembly.experiments import build
+from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.checks import RunError
 from pegasus_jax.config import Config
 from pegasus_jax.learn.data import Dataset
@@ -80,6 +80,7 @@ def read_config(config: Config, task: Task) -> tuple[list[Logged], list[str]]:
     """(the episodes that a config names, notes on them: one line each). Raises ConfigError for what cannot be."""
     if not config.data:
         return [], []
+    set_precision(config)
     found, notes = read(config.data, task, config.data_columns, config.data_control)
     files = len({one.source for one in found})
     return found, [
