@@ -1,6 +1,7 @@
 """MCAP files and ROS bags as tables, read by `rosbags` without ROS. Needs the extra `logs`."""
 
 from collections.abc import Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -75,11 +76,10 @@ def _series(path: Path, bag: Any, column: str) -> Series:
 
 def _field(path: Path, column: str, value: Any, fields: Sequence[str]) -> float:
     """The number in a message where the path of fields leads, those of arrays by their place."""
-    for field in fields:
-        inner = value[int(field)] if field.isdecimal() and np.ndim(value) and int(field) < len(value) else None
-        value = getattr(value, field, None) if inner is None else inner
-        if value is None:
-            break
-    if np.ndim(value) or not isinstance(value, int | float | np.number):
-        raise ConfigError(f"{path}: {column} is no number in a message; expected {SETTING}=[/topic.field.0,...]")
-    return float(value)
+    try:
+        for field in fields:
+            value = value[int(field)] if field.isdecimal() else attrgetter(field)(value)
+        return float(value)
+    except (AttributeError, IndexError, TypeError, ValueError):
+        wanted = f"{SETTING}=[/topic.field.0,...]"
+        raise ConfigError(f"{path}: {column} is no number in a message; expected {wanted}") from None

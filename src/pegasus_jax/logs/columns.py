@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pegasus_jax.checks import ConfigError, did_you_mean, shown
-from pegasus_jax.logs.table import EPISODE, TIMES, Names, Table
+from pegasus_jax.logs.table import EPISODE, TIMES, Names, Table, plain
 
 SETTING = "data_columns"
 
@@ -76,7 +76,8 @@ def layout(table: Table, names: Names, columns: Sequence[str]) -> tuple[Layout, 
     note = ""
     if not said:
         rest = [name for name in table.names if name not in (episode, time and time.name)]
-        if not {*known} & {*rest}:
+        own = {plain(name): name for name in rest}
+        if not {*known} & {*own}:
             if len(rest) != len(known):
                 raise ConfigError(
                     f"{table.source} has {len(rest)} columns, {', '.join(rest)}; expected {len(known)}:"
@@ -85,7 +86,7 @@ def layout(table: Table, names: Names, columns: Sequence[str]) -> tuple[Layout, 
             said = {name: Column(column) for name, column in zip(known, rest, strict=True)}
             note = f"by their order, {', '.join(rest)} are {', '.join(known)}"
         else:
-            said = {name: Column(name) for name in known}
+            said = {name: Column(own.get(name, name)) for name in known}
     for column in (*said.values(), *([time] if time else [])):
         if column.name not in table.names:
             raise ConfigError(

@@ -125,9 +125,9 @@ def periods(one: Segment, task: Task, note: Note) -> Segment:
     grid = one.t[0] + task.dt * np.arange(count + 1)
     x = np.column_stack([interpolated(grid, one.t, column, i in task.angles) for i, column in enumerate(one.x.T)])
     held = np.searchsorted(one.t, grid[:-1] + slack, side="right") - 1
-    last = np.searchsorted(one.t, grid[1:] - slack, side="left") - 1
+    within = np.minimum((one.t[:-1] - one.t[0] + slack) // task.dt, count - 1).astype(int)  # the period of each row
     note(f"a row every {np.median(steps):.3g} s or so: resampled to dt={task.dt:g}")
-    if np.any(one.u[held] != one.u[np.minimum(last, len(one.u) - 1)]):
+    if np.any(one.u != one.u[held][within]):
         note(f"controls change within periods of dt={task.dt:g}; those at their beginning are taken")
     return Segment(grid, x, one.u[held])
 

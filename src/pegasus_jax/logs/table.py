@@ -49,8 +49,18 @@ def names_of(task: Task) -> Names:
     size = len(task.state_names) + len(task.circles)
     kept, paired = circles.entries(size, task.circles), {entry for pair in task.circles for entry in pair}
     place = {entry: kept.index(entry) for entry in kept if entry not in paired}
-    observation = tuple(task.state_names[place[i]] if i in place else f"x{i}" for i in range(size))
-    return Names(observation, task.control_names, tuple(place.get(i) in task.angles for i in range(size)), task.dt)
+    observation = tuple(plain(task.state_names[place[i]]) if i in place else f"x{i}" for i in range(size))
+    return Names(
+        observation,
+        tuple(map(plain, task.control_names)),
+        tuple(place.get(i) in task.angles for i in range(size)),
+        task.dt,
+    )
+
+
+def plain(name: str) -> str:
+    """A name without its unit, as in "rate [rad/s]"."""
+    return name.partition(" [")[0]
 
 
 def of_csv(path: Path) -> Table:
@@ -137,4 +147,5 @@ def _number(cell: str) -> float | None:
 
 def reason(error: Exception) -> str:
     """Why something could not be read, in one line."""
-    return str(getattr(error, "strerror", None) or " ".join(str(error).split()))
+    known = error.strerror if isinstance(error, OSError) else None
+    return known or " ".join(str(error).split())

@@ -19,6 +19,7 @@ from pegasus_jax.runs.removed import refuse, today
 
 # Keys that select what a command begins with, and what they select from.
 NAMED: dict[str, Any] = {"task": TASKS, **WORDS}
+FILES = ("data",)  # settings of files and patterns: one, or a list of them; * means something else in YAML
 
 
 def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, str], dict[str, str]]:
@@ -103,11 +104,7 @@ def _with_arguments(words: Mapping[str, Any]) -> dict[str, Any]:
 
 def values(words: Mapping[str, Any]) -> dict[str, Any]:
     """What the texts on the right of `key=` mean, read as YAML; what is no text is a value already."""
-    return {key: _value(key, text) if isinstance(text, str) else text for key, text in words.items()} | (
-        {"data": [name.strip() for name in words["data"].strip("[]").split(",") if name.strip()]}  # * is no YAML
-        if isinstance(words.get("data"), str)
-        else {}
-    )
+    return {key: _value(key, text) if isinstance(text, str) else text for key, text in words.items()}
 
 
 def override(config: Config, changes: dict[str, Any]) -> Config:
@@ -203,6 +200,9 @@ def _hint(key: str, choices: Sequence[str]) -> str:
 
 
 def _value(key: str, text: str) -> Any:
+    if key in FILES:
+        inner = text[1:-1] if text.startswith("[") and text.endswith("]") else text
+        return [name.strip() for name in inner.split(",") if name.strip()]
     try:
         return OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]))["value"]  # type: ignore[index,call-overload]
     except Exception as error:

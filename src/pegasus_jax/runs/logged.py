@@ -62,8 +62,10 @@ def load(run: Path) -> list[Logged]:
     return found
 
 
-def kept(run: Path) -> Logs:
-    """The logs of a run's folder."""
+def of_run(config: Config, run: Path) -> Logs:
+    """The logs of a run's folder, where its config says that it has some. Raises RunError as `load` does."""
+    if not config.data:
+        return NONE
     lengths = [len(store.arrays(_path(run, number), "u")["u"]) for number in range(1, _count(run) + 1)]
     return Logs(sum(lengths), lambda: load(run))
 

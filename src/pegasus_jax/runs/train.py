@@ -80,9 +80,7 @@ def train_seeds(
         before = config_io.load(folders[0] / "config.yaml") if resume else config
         if config.trials < before.trials:
             raise ConfigError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
-        begun = (
-            logged.of_config(config, logs) if not resume else logged.kept(folders[0]) if config.data else logged.NONE
-        )
+        begun = logged.of_run(config, folders[0]) if resume else logged.of_config(config, logs)
         job = held.enter_context(opened(config, list(runs), mesh, begun))
         task, say = job.experiment.task, job.display.line
         for run in folders if begun.rows and not resume and is_main_process() else ():
