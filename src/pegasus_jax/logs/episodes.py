@@ -68,7 +68,8 @@ def _cuts(
             f"{table.where(rows[0])}: a row every {usual:g} s is too rare for dt={task.dt:g}; in other units?"
             f" {SETTING}=[t=COLUMN*0.001,...] makes seconds of milliseconds"
         )
-    whole, known = (np.isfinite(numbers).all(1) for numbers in seen)
+    whole: np.ndarray = np.all(np.isfinite(seen[0]), axis=1)
+    known: np.ndarray = np.all(np.isfinite(seen[1]), axis=1)
     gaps = steps > GAP * max(usual, task.dt)
     for i in np.flatnonzero(gaps)[:1]:
         note(f"{table.unit} {table.lines[rows[i + 1]]} comes {steps[i]:.3g} s after the one before it; cut there")

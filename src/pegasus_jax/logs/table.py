@@ -30,7 +30,7 @@ class Table(NamedTuple):
     unit: str = "row"  # of the file that a row is
     texts: Texts = {}  # noqa: RUF012  (row, column) -> what is there instead of a number
 
-    def where(self, row: int) -> str:
+    def where(self, row: Any) -> str:
         """What to call a row."""
         return f"{self.source} {self.unit} {self.lines[row]}"
 

@@ -112,9 +112,9 @@ def added(states: RunState, logged: Sequence[Logged], task: Task) -> RunState:
         np.concatenate(parts) for parts in zip(*(_transitions(one.trajectory, task) for one in logged), strict=True)
     )
 
-    def with_rows(data: Any) -> Any:
-        new = zip(data[:3], (x, u, y), strict=True)
-        return Dataset(*(old.at[: len(u)].set(rows) for old, rows in new), data.size + len(u))
+    def with_rows(data: Dataset) -> Dataset:
+        x_, u_, y_ = (old.at[: len(u)].set(rows) for old, rows in zip(data[:3], (x, u, y), strict=True))
+        return Dataset(x_, u_, y_, data.size + len(u))
 
     return states._replace(data=jax.vmap(with_rows)(states.data), trial=states.trial + 1)
 
