@@ -248,7 +248,8 @@ def logs_of(path: Path, episodes: int = 3):
 def test_the_data_are_those_of_add_episode(tmp_path):
     logs = logs_of(tmp_path)
     data = jax.tree.map(lambda leaf: leaf[None], dataset.empty(40, 2, 1))
-    states = RunState(None, data, None, None, jnp.zeros(1, int), jnp.zeros(1, int))  # type: ignore[arg-type]
+    counts = jnp.zeros(1, int)
+    states = RunState(None, data, None, None, counts, counts, counts > 0)  # type: ignore[arg-type]
     found = logged.added(states, logs, CART)
     one = dataset.empty(40, 2, 1)
     for log in logs:

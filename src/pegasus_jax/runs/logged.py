@@ -20,6 +20,7 @@ from pegasus_jax.logs.read import Logged, read
 from pegasus_jax.math.angles import difference
 from pegasus_jax.runs import store
 from pegasus_jax.runs.files import write_whole
+from pegasus_jax.runs.programs import gather
 from pegasus_jax.types import RunState, Task, Trajectory
 
 FOLDER = "logged"  # in a run's folder
@@ -116,7 +117,8 @@ def added(states: RunState, logged: Sequence[Logged], task: Task) -> RunState:
         x_, u_, y_ = (old.at[: len(u)].set(rows) for old, rows in zip(data[:3], (x, u, y), strict=True))
         return Dataset(x_, u_, y_, data.size + len(u))
 
-    return states._replace(data=jax.vmap(with_rows)(states.data), trial=states.trial + 1)
+    data, trial = gather((states.data, states.trial))  # of several processes, each has all
+    return states._replace(data=jax.vmap(with_rows)(data), trial=jnp.asarray(trial) + 1)
 
 
 def _transitions(one: Trajectory, task: Task) -> tuple[Any, Any, Any]:

@@ -113,7 +113,7 @@ def learn(job: Job, states: RunState, done: int = 0) -> RunState:
         job.writer.trial(trial, states, rows)
         for line in (summary(rows, job.config.trials), *stuck(before, rows)):
             job.display.line(line)
-        before = [] if trial == 1 and job.logs.rows else rows
+        before = [] if "logs" in rows[0] else rows
     return states
 
 
