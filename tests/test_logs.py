@@ -179,12 +179,13 @@ def test_a_map_that_cannot_be_is_refused(columns, part, tmp_path):
 
 @pytest.mark.parametrize("degrees", [[170.0, 160, 150], [5.0, 20, 35, 55]])
 def test_degrees_are_told_from_radians(degrees, tmp_path):
-    text = "angle,turn\n" + "".join(f"{angle},0\n" for angle in degrees)
+    text = "episode,angle,turn\n0,0,0\n0,0,0\n" + "".join(f"1,{angle},0\n" for angle in degrees)
     (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(ConfigError, match=r"angle is .*looks like degrees.*angle\*0.0174533"):
+    line = 4 if degrees[0] > 100 else 5
+    with pytest.raises(ConfigError, match=rf"line {line}: angle is .*looks like degrees.*angle\*0.0174533"):
         read([str(tmp_path / "a.csv")], DIAL)
     (x, _, _), _ = transitions(DIAL, str(tmp_path / "a.csv"), columns=("angle*0.017453293", "turn"))
-    np.testing.assert_allclose(x[:, 0], np.deg2rad(degrees[:-1]), atol=1e-6)
+    np.testing.assert_allclose(x[1:, 0], np.deg2rad(degrees[:-1]), atol=1e-6)
     spins = "angle,turn\n" + "".join(f"{angle:.3f},0\n" for angle in np.arange(0, 40, 1.5))  # an encoder that goes on
     (tmp_path / "a.csv").write_text(spins)
     assert len(read([str(tmp_path / "a.csv")], DIAL)[0]) == 5
@@ -220,6 +221,9 @@ def test_the_episodes_of_another_run_are_read_as_they_are(tmp_path):
     np.testing.assert_allclose(one.trajectory.x, x, atol=1e-5)
     np.testing.assert_allclose(one.trajectory.cost, np.cos(x[1:, 1]), atol=1e-5)
     assert notes == []
+    np.savez(tmp_path / "0001.npz", observation=np.ones((4, 3)), u=u)
+    with pytest.raises(ConfigError, match=r"0001.npz row 0: x1 and x2 are no cosine and sine .* is 1.41"):
+        read([str(tmp_path / "0001.npz")], task)
 
 
 def test_python_adds_them_as_episodes(tmp_path):

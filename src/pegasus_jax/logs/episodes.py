@@ -15,6 +15,7 @@ JITTER = 0.05  # of a period, by which rows may come early or late without being
 GAP = 3.0  # periods without a row that end an episode
 RARE = 5.0  # control periods from row to row that no interpolation fills
 ROUNDING = 1e-3  # of a control's range, by which a file's numbers may be beyond it
+ROUND = 0.1  # by which a cosine and a sine may miss the unit circle
 TURNS = 4 * np.pi  # [rad] an angle at the start of an episode that is greater must be in degrees
 
 Note = Callable[[str], None]
@@ -48,7 +49,7 @@ def segments(table: Table, where: Layout, task: Task, control: str, note: Note) 
     for rows in np.split(np.arange(len(t)), np.flatnonzero(begins) + 1):
         if len(rows) > 1:
             u = sent[rows] if control == "sent" else np.vstack([sent[rows[1:]], np.full_like(sent[:1], np.nan)])
-            _radians(table, rows, observed, where, task)
+            _radians(table, rows, observed[rows], where, task)
             cuts = _cuts(table, rows, t[rows], (observed[rows], u), task, note)
             for part in np.split(np.arange(len(rows)), cuts):
                 if len(part) > 1:
@@ -83,7 +84,15 @@ def _cuts(
 
 
 def _radians(table: Table, rows: np.ndarray, observed: np.ndarray, where: Layout, task: Task) -> None:
-    """Raises ConfigError for an angle that cannot be in radians."""
+    """Raises ConfigError for an angle that cannot be in radians, and for a pair that is no cosine and sine."""
+    for pair in task.circles:
+        radius = np.hypot(*observed[:, pair].T)
+        for row in np.flatnonzero(np.abs(radius - 1) > ROUND)[:1]:
+            names = " and ".join(where.observation[entry].name for entry in pair)
+            raise ConfigError(
+                f"{table.where(rows[row])}: {names} are no cosine and sine of an angle: the root of the sum of their"
+                f" squares is {radius[row]:.3g}"
+            )
     places = entries(observed.shape[1], task.circles)
     paired = {entry for pair in task.circles for entry in pair}
     for entry in (places[angle] for angle in task.angles if places[angle] not in paired):

@@ -4,6 +4,7 @@ import csv
 import math
 from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ class Table(NamedTuple):
     rows: np.ndarray  # [N, C] float64; NaN where there is no number
     lines: np.ndarray  # [N] what a person calls its rows
     unit: str = "row"  # of the file that a row is
-    texts: Texts = {}  # noqa: RUF012  (row, column) -> what is there instead of a number
+    texts: Texts = MappingProxyType({})  # (row, column) -> what is there instead of a number
 
     def where(self, row: Any) -> str:
         """What to call a row."""
