@@ -14,7 +14,7 @@ from pegasus_jax.logs.read import read
 from pegasus_jax.math import circles
 from pegasus_jax.runs import config_io, logged, store
 from pegasus_jax.types import Cost, RunState
-from probes import cart, dial
+from probes import cart, dial, tiny
 
 # Five rows of the cart of probes.py, a period of .3 s apart: position, velocity, force.
 ROWS = np.array([[0, 0, 0.5], [0.1, 1, -0.5], [0.3, 2, 1], [0.4, -1, 2], [0.2, 0, 0]])
@@ -250,16 +250,18 @@ def logs_of(path: Path, episodes: int = 3):
 
 
 def test_the_data_are_those_of_add_episode(tmp_path):
-    logs = logs_of(tmp_path)
+    logs, experiment = logs_of(tmp_path), pg.compose(tiny(trials=4, explore__trials=0), CART, logged=12)
+    state = jax.eval_shape(experiment.init, jax.random.key(0))
+    assert state.data.x.shape == (4 * 8 + 12, 2)
     data = jax.tree.map(lambda leaf: leaf[None], dataset.empty(40, 2, 1))
     counts = jnp.zeros(1, int)
     states = RunState(None, data, None, None, counts, counts, counts > 0)  # type: ignore[arg-type]
-    found = logged.added(states, logs, CART)
+    found = logged.added(states, logs, experiment)
     one = dataset.empty(40, 2, 1)
     for log in logs:
         one = dataset.add(one, log.trajectory, ())
     jax.tree.map(lambda a, b: np.testing.assert_array_equal(a[0], b), found.data, one)
-    assert int(found.trial[0]) == 1
+    assert (int(found.trial[0]), bool(found.succeeded[0])) == (1, False)
     assert logged.told(logs, CART)["log_seconds"] == pytest.approx(3 * 4 * 0.3)
 
 

@@ -9,15 +9,14 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.checks import RunError
 from pegasus_jax.config import Config
-from pegasus_jax.learn.data import Dataset
+from pegasus_jax.episode import padded
+from pegasus_jax.experiment import Experiment
 from pegasus_jax.logs.read import Logged, read
-from pegasus_jax.math.angles import difference
 from pegasus_jax.runs import store
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.programs import gather
@@ -107,23 +106,13 @@ def _count(run: Path) -> int:
     return count
 
 
-def added(states: RunState, logged: Sequence[Logged], task: Task) -> RunState:
-    """The states [S, ...], each with the episodes in its data, as `add_episode` would; as one trial."""
-    x, u, y = (
-        np.concatenate(parts) for parts in zip(*(_transitions(one.trajectory, task) for one in logged), strict=True)
-    )
-
-    def with_rows(data: Dataset) -> Dataset:
-        x_, u_, y_ = (old.at[: len(u)].set(rows) for old, rows in zip(data[:3], (x, u, y), strict=True))
-        return Dataset(x_, u_, y_, data.size + len(u))
-
-    data, trial = gather((states.data, states.trial))  # of several processes, each has all
-    return states._replace(data=jax.vmap(with_rows)(data), trial=jnp.asarray(trial) + 1)
-
-
-def _transitions(one: Trajectory, task: Task) -> tuple[Any, Any, Any]:
-    x = jnp.asarray(one.x)
-    return one.x[:-1], one.u, np.asarray(difference(x[1:], x[:-1], task.angles))
+def added(states: RunState, logged: Sequence[Logged], experiment: Experiment) -> RunState:
+    """The states [S, ...] with the episodes in their data, all as one trial; whether they succeeded is no policy's."""
+    add = jax.jit(jax.vmap(experiment.add_episode, (0, None)))
+    found = gather(states)  # of several processes, each has all
+    for one in logged:
+        found = add(found, padded(one.trajectory, experiment.task.horizon))
+    return found._replace(trial=gather(states.trial) + 1, succeeded=gather(states.succeeded))
 
 
 def told(logged: Sequence[Logged], task: Task) -> dict[str, Any]:
@@ -137,10 +126,3 @@ def told(logged: Sequence[Logged], task: Task) -> dict[str, Any]:
         "steps": len(costs),
         "ended": "horizon",
     }
-
-
-def blank(task: Task) -> Trajectory:
-    """An episode of the shapes that the plant's will have, to compile programs before the first of them."""
-    kind = np.float32 if task.environment is not None else jnp.zeros(()).dtype
-    sizes = ((task.horizon + 1, len(task.state_names)), (task.horizon, len(task.control_names)), (task.horizon,))
-    return Trajectory(*(np.zeros(size, kind) for size in sizes))  # type: ignore[arg-type]

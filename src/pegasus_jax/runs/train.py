@@ -122,10 +122,9 @@ def of_logs(job: Job, states: RunState) -> tuple[RunState, list[Row]]:
     config, task, program = job.config, job.experiment.task, job.program
     job.display.phase(1, "read")
     logs = job.logs.episodes()
-    states, found = logged.added(states, logs, task), [UNKNOWN] * len(job.seeds)
+    states, found = logged.added(states, logs, job.experiment), [UNKNOWN] * len(job.seeds)
     if config.explore.trials < 2:
-        blank = stacked([episode.Episode(logged.blank(task))] * len(job.seeds), task)
-        states, found = improved(job, states, 1, blank)
+        states, found = improved(job, states, 1)
     evaluation = evaluated(job, states, 1)
     own = {"trial": 1, "plant_seconds": 0.0, "random": False, "policy": 0, **logged.told(logs, task)}
     controls = np.concatenate([one.trajectory.u for one in logs])
@@ -177,7 +176,9 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Ro
     ]
 
 
-def improved(job: Job, states: RunState, trial: int, trajectories: Trajectory) -> tuple[RunState, list[Row]]:
+def improved(
+    job: Job, states: RunState, trial: int, trajectories: Trajectory | None = None
+) -> tuple[RunState, list[Row]]:
     """Fit, search, and imagine what comes (lines 5 and 6 of Alg. 1); how it went, of each seed.
 
     Where no seed's model, or no seed's policy, could learn anything, the writer is told.
@@ -197,7 +198,8 @@ def improved(job: Job, states: RunState, trial: int, trajectories: Trajectory) -
         states, searched = program("search", states, jnp.int32(i * program.chunk))
         found.append(jax.tree.map(np.asarray, gather(searched)))
         program.prepare("succeed", incumbents)  # once; not before the first of the search, for which everybody waits
-        program.prepare("calibrate", trajectories)
+        if trajectories is not None:
+            program.prepare("calibrate", trajectories)
     objective, norm = (np.concatenate([getattr(f, name) for f in found], 1) for name in ("objective", "gradient_norm"))
     if not np.any(np.isfinite(objective) & np.isfinite(norm)):
         lost = "the imagined cost or its gradient is not finite in any iteration"
