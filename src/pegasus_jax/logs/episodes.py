@@ -7,8 +7,9 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.logs.columns import SETTING, Column, Layout, numbers
-from pegasus_jax.logs.table import Table
-from pegasus_jax.math.circles import entries, to_state
+from pegasus_jax.logs.table import Table, names_of
+from pegasus_jax.math.circles import to_state
+from pegasus_jax.memory import measured
 from pegasus_jax.types import Task
 
 JITTER = 0.05  # of a period, by which rows may come early or late without being interpolated
@@ -25,7 +26,7 @@ class Segment(NamedTuple):
     """Rows of one episode that follow each other without a gap."""
 
     t: np.ndarray  # [L+1] [s]
-    x: np.ndarray  # [L+1, D] states
+    x: np.ndarray  # [L+1, D] states, as far as they are measured
     u: np.ndarray  # [L, U] what was sent at the times 0..L-1
 
 
@@ -93,9 +94,7 @@ def _radians(table: Table, rows: np.ndarray, observed: np.ndarray, where: Layout
                 f"{table.where(rows[row])}: {names} are no cosine and sine of an angle: the root of the sum of their"
                 f" squares is {radius[row]:.3g}"
             )
-    places = entries(observed.shape[1], task.circles)
-    paired = {entry for pair in task.circles for entry in pair}
-    for entry in (places[angle] for angle in task.angles if places[angle] not in paired):
+    for entry in np.flatnonzero(names_of(task).turning):
         angle = observed[:, entry]
         jumps = np.abs(np.diff(angle))
         odd = (jumps > np.pi) & (np.abs(jumps - 2 * np.pi) > np.pi / 2)  # neither a move nor a seam at 180 degrees
@@ -133,13 +132,30 @@ def periods(one: Segment, task: Task, note: Note) -> Segment:
     slack = 1e-3 * task.dt
     count = int((one.t[-1] - one.t[0] + slack) / task.dt)
     grid = one.t[0] + task.dt * np.arange(count + 1)
-    x = np.column_stack([interpolated(grid, one.t, column, i in task.angles) for i, column in enumerate(one.x.T)])
+    turning = [i in task.angles for i in measured(task)]
+    x = np.column_stack([interpolated(grid, one.t, *pair) for pair in zip(one.x.T, turning, strict=True)])
     held = np.searchsorted(one.t, grid[:-1] + slack, side="right") - 1
     within = np.minimum((one.t[:-1] - one.t[0] + slack) // task.dt, count - 1).astype(int)  # the period of each row
     note(f"a row every {np.median(steps):.3g} s or so: resampled to dt={task.dt:g}")
     if np.any(one.u != one.u[held][within]):
         note(f"controls change within periods of dt={task.dt:g}; those at their beginning are taken")
     return Segment(grid, x, one.u[held])
+
+
+def with_rates(x: np.ndarray, task: Task) -> np.ndarray:
+    """States [L+1, D] of what is measured of them; their rates are differences from row to row."""
+    places = list(measured(task))
+    if len(places) == len(task.state_names):
+        return x
+    whole = np.zeros((len(x), len(task.state_names)))
+    whole[:, places] = x
+    coordinates = [i for i in range(len(task.state_names)) if i not in task.rates]
+    for i, rate in zip(coordinates, task.rates, strict=True):
+        change = np.diff(whole[:, i])
+        change = np.arctan2(np.sin(change), np.cos(change)) if i in task.angles else change
+        whole[1:, rate] = change / task.dt
+    whole[0] = np.where(np.isin(np.arange(len(task.state_names)), task.rates), whole[1], whole[0])
+    return whole
 
 
 def interpolated(

@@ -7,16 +7,18 @@ from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from pegasus_jax import episode
+from pegasus_jax import memory as recall
 from pegasus_jax.checks import ConfigError, choice
 from pegasus_jax.config import DATA_CONTROLS
-from pegasus_jax.episode import padded
 from pegasus_jax.logs import bags, minari_sets
 from pegasus_jax.logs.columns import layout
-from pegasus_jax.logs.episodes import Segment, periods, segments
+from pegasus_jax.logs.episodes import Segment, periods, segments, with_rates
 from pegasus_jax.logs.table import Names, Table, names_of, of_csv, of_npz
-from pegasus_jax.types import Task, Trajectory
+from pegasus_jax.types import Array, Task, Trajectory
 
 
 class Logged(NamedTuple):
@@ -43,7 +45,7 @@ def load_logs(
     found, notes = read([files] if isinstance(files, str) else files, task, columns, control)
     for note in notes:
         warnings.warn(note, stacklevel=2)
-    return [padded(one.trajectory, task.horizon) for one in found]
+    return [episode.padded(one.trajectory, task.horizon) for one in found]
 
 
 def read(
@@ -98,19 +100,26 @@ def _table(path: Path, names: Names, columns: Sequence[str]) -> Table:
 
 
 def _trajectories(found: list[tuple[Segment, str]], task: Task) -> list[Logged]:
-    """Parts of at most H periods, each with its costs. Raises ConfigError where a cost is not a finite number."""
-    size, kind = task.horizon, np.float32 if task.environment is not None else np.asarray(jax.numpy.zeros(())).dtype
-    parts = [
-        (one.x[i : i + size + 1].astype(kind), one.u[i : i + size].astype(kind), source)
-        for one, source in found
-        for i in range(0, len(one.u), size)
-    ]
-    seen = np.concatenate([x[1:] for x, _, _ in parts])
-    costs = np.asarray(jax.vmap(task.cost.of_state)(jax.numpy.asarray(seen))).astype(kind)
-    for (row,) in np.argwhere(~np.isfinite(costs))[:1]:
-        raise ConfigError(f"data=: the cost of the logged observation {seen[row].tolist()} is {costs[row]}")
-    each = np.split(costs, np.cumsum([len(u) for _, u, _ in parts])[:-1])
-    return [
-        Logged(Trajectory(x, u, cost), source)  # type: ignore[arg-type]
-        for (x, u, source), cost in zip(parts, each, strict=True)
-    ]
+    """Parts of at most H periods, each with its costs and what is remembered at its start.
+
+    Raises ConfigError where a cost is not a finite number.
+    """
+    size, kind = task.horizon, np.float32 if task.environment is not None else jnp.zeros(()).dtype
+    parts: list[Logged] = []
+
+    @jax.jit
+    def known(whole: Trajectory) -> tuple[Array, Array | None]:
+        costs = jax.vmap(task.cost.of_state)(episode.states(task, whole)[1:])
+        return costs, recall.replay(task.memory, whole)
+
+    for one, source in found:
+        x, u, m = with_rates(one.x, task).astype(kind), one.u.astype(kind), None
+        for i in range(0, len(u), size):
+            rows = u[i : i + size]
+            part = Trajectory(x[i : i + size + 1], rows, np.zeros(len(rows), kind), memory=m)  # type: ignore[arg-type]
+            costs, remembered = jax.tree.map(np.asarray, known(episode.padded(part, size)))
+            for (row,) in np.argwhere(~np.isfinite(costs[: len(rows)]))[:1]:
+                raise ConfigError(f"{source}: the cost of the observation {part.x[row + 1].tolist()} is {costs[row]}")
+            start, m = (None, None) if remembered is None else (remembered[0], remembered[len(rows)])
+            parts.append(Logged(part._replace(cost=costs[: len(rows)].astype(kind), memory=start), source))
+    return parts

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from pegasus_jax import memory
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.math import circles
 from pegasus_jax.types import Task
@@ -46,17 +47,17 @@ class Names(NamedTuple):
 
 
 def names_of(task: Task) -> Names:
-    """The names of a task's observation and controls; x0, x1, ... are cosines and sines of an angle of its state."""
-    size = len(task.state_names) + len(task.circles)
-    kept, paired = circles.entries(size, task.circles), {entry for pair in task.circles for entry in pair}
-    place = {entry: kept.index(entry) for entry in kept if entry not in paired}
-    observation = tuple(plain(task.state_names[place[i]]) if i in place else f"x{i}" for i in range(size))
-    return Names(
-        observation,
-        tuple(map(plain, task.control_names)),
-        tuple(place.get(i) in task.angles for i in range(size)),
-        task.dt,
-    )
+    """The names of what a controller of the task is given, cosines and sines where the state has their angle."""
+    given = memory.measured(task)
+    size, names = len(given) + len(task.circles), [plain(name) for name in task.state_names]
+    place = dict(zip(circles.entries(size, task.circles), given, strict=True))
+    observed = {entry: names[place[entry]] for entry in place}
+    for pair in task.circles:  # of atan2(sine, cosine)
+        sine, _, cosine = observed[min(pair)].removeprefix("atan2(").removesuffix(")").partition(", ")
+        observed |= dict(zip(pair, (cosine, sine), strict=True))
+    paired = {entry for pair in task.circles for entry in pair}
+    turning = tuple(i not in paired and place[i] in task.angles for i in range(size))
+    return Names(tuple(observed[i] for i in range(size)), tuple(map(plain, task.control_names)), turning, task.dt)
 
 
 def plain(name: str) -> str:

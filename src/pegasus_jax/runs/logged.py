@@ -58,7 +58,8 @@ def load(run: Path) -> list[Logged]:
         known = store.arrays(_path(run, number), *store.EPISODE, "source")
         if wrong := store.wrong(known, 1, task):
             raise RunError(f"{_path(run, number)} {wrong}")
-        found.append(Logged(Trajectory(*(known[name] for name in ("x", "u", "cost"))), str(known["source"])))  # type: ignore[arg-type]
+        rows = (known[name] for name in ("x", "u", "cost"))
+        found.append(Logged(Trajectory(*rows, memory=known.get("memory")), str(known["source"])))  # type: ignore[arg-type]
     return found
 
 
