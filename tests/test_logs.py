@@ -376,3 +376,36 @@ def test_a_library_that_is_missing_is_named(tmp_path, monkeypatch):
     for name, extra in (("minari:cart/byhand-v0", "minari"), (str(tmp_path / "a.mcap"), "logs")):
         with pytest.raises(ConfigError, match=rf"pip install 'pegasus-jax\[{extra}\]'"):
             read([name], CART, TOPICS)
+
+
+# Tasks whose state is more than what is measured
+
+
+def test_rates_that_a_robot_computes_are_computed_of_a_log(tmp_path):
+    """From row to row, across the seam of an angle; at the start as after it."""
+    config = config_io.parse({"task": "cartpole", "sensors.measured": "[0,3]", "sensors.velocity": "difference"})
+    task = pg.build(config).task
+    t = np.arange(40)
+    x, angle = 0.1 * np.sin(t), (3 + 0.3 * t + np.pi) % (2 * np.pi) - np.pi
+    rows = np.column_stack([x, angle, np.cos(t)])
+    found = read([written(tmp_path / "a.csv", "x,theta,force", rows)], task)[0]
+    names = [name.partition(" [")[0] for name in task.state_names]
+    seen = np.concatenate([one.trajectory.x[: len(one.trajectory.u)] for one in found])
+    assert [len(one.trajectory.u) for one in found] == [25, 14]
+    np.testing.assert_allclose(seen[1:, names.index("theta'")], 3.0, atol=1e-4)
+    np.testing.assert_allclose(seen[1:, names.index("x'")], np.diff(x)[:-1] / task.dt, atol=1e-5)
+    assert seen[0, names.index("theta'")] == pytest.approx(3.0, abs=1e-4)
+
+
+def test_what_a_controller_remembers_goes_on_from_part_to_part(tmp_path):
+    """Each part begins with the rows before it, and its costs are those of the whole."""
+    config = config_io.parse({"task": "cartpole", "history": "2", "model.hidden": "[4]", "policy.hidden": "[4]"})
+    experiment = pg.build(config)
+    rows = np.random.default_rng(0).uniform(-1, 1, (40, 5))
+    first, second = read([written(tmp_path / "a.csv", "x,x',theta',theta,force", rows)], experiment.task)[0]
+    assert first.trajectory.memory is not None
+    place = [i for i, name in enumerate(experiment.task.memory.names) if "force" in name]
+    np.testing.assert_allclose(second.trajectory.memory[place], rows[24, 4:], atol=1e-5)
+    state = jax.eval_shape(experiment.init, jax.random.key(0))
+    for one in pg.load_logs(str(tmp_path / "a.csv"), experiment.task):
+        state = jax.eval_shape(experiment.add_episode, state, one)
