@@ -6,6 +6,7 @@ import itertools
 import re
 import subprocess
 import sys
+import tempfile
 import typing
 from collections.abc import Callable, Iterator
 from functools import partial
@@ -116,6 +117,7 @@ IMPURE = {
     "controller",
     "delay_of",
     "export",
+    "load_logs",
     "tasks.make",
     "tasks.of_config",
     "angles.feature_names",
@@ -187,6 +189,18 @@ def _() -> Any:
     assert isinstance(found, pg.Delay)
     assert found.periods == 1
     return found.probabilities
+
+
+@example("load_logs")
+def _() -> Any:
+    """As `add_episode` takes them: in arrays of H periods, with their lengths."""
+    rows = np.column_stack([np.asarray(trajectory().x)[:4], np.asarray(trajectory().u)[:4]])
+    with tempfile.TemporaryDirectory() as folder:
+        np.savetxt(file := f"{folder}/log.csv", rows, delimiter=",", header="position,velocity,force", comments="")
+        with pytest.warns(UserWarning, match="rows are taken to be dt=0.3 s apart"):
+            (log,) = pg.load_logs(file, TASK)
+    assert (log.x.shape, int(log.length)) == ((H + 1, D), 3)  # pyright: ignore[reportArgumentType]
+    return log
 
 
 @example("dynamics_of", "bnn", "ensemble", "lagrangian", "gp", "ssgp")

@@ -214,6 +214,7 @@ def test_every_block_is_a_program_a_file_or_commands() -> None:
         "robot.c",
         "in_runtimes.py",
         "export_both.py",
+        "hand.py",
     }
     assert len(PROGRAMS) >= 4
 

@@ -20,7 +20,7 @@ LAYERS = {
     2: "config models. imagine. episode",
     3: "presets policies. learn.",
     4: "tasks. pilco. experiment",
-    5: "assembly.",
+    5: "assembly. logs.",
     6: "runs.",
     7: "viz. exports.",
     8: "cli. deploy __init__",

@@ -174,6 +174,9 @@ def test_the_method_has_few_settings():
         "start_std",
         "starts",
         "success",
+        "data",
+        "data_columns",
+        "data_control",
     }
     fields = [*dict.fromkeys(name.partition(".")[0] for name in config_io.used_by())]
     assert [field.name for field in dataclasses.fields(Config)][-len(fields) :] == fields

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from pegasus_jax.learn.search import SearchState as SearchState
     from pegasus_jax.learn.search import search as search
     from pegasus_jax.learn.search import searcher as searcher
+    from pegasus_jax.logs.read import load_logs as load_logs
     from pegasus_jax.math import angles as angles
     from pegasus_jax.math import gaussian as gaussian
     from pegasus_jax.math.delays import Delay as Delay
@@ -91,6 +92,7 @@ _NAMES = {
     # a run, from settings
     "config": "Config",
     "runs.start": "preset train",
+    "logs.read": "load_logs",
     "assembly.experiments": "build compose",
     "assembly.pieces": "dynamics_of policy_of",
     "experiment": "run trial Experiment Successor TrialInfo",

@@ -30,6 +30,7 @@ VELOCITIES = ("none", "difference", "filter")
 INITS = ("previous", "better", "fresh")
 LEGS = (2, 6)
 SUCCESSORS = ("always", "better")
+DATA_CONTROLS = ("sent", "before")
 
 
 @dataclass(frozen=True)
@@ -357,6 +358,13 @@ class Config:
         (), "observations where episodes start, equally likely; []: 100 resets, or as start_mean says", EVERY
     )
     success: float = setting(0.2, "the mean cost of an episode's last five steps is less than this", OWN)
+    data: tuple[str, ...] = setting(
+        (), "logs that are trial 1: logs/*.csv, .npz, .mcap, .db3, .bag, or minari:NAME; [a,b] for several", ("*",)
+    )
+    data_columns: tuple[str, ...] = setting(
+        (), "their columns: the observation's, the controls'; NAME=COLUMN*FACTOR; []: by name, else in order", ("*",)
+    )
+    data_control: str = setting("sent", "their controls are those sent at a row's time, or before: to reach it", ("*",))
 
     def __post_init__(self) -> None:
         checks.typed("", self)
@@ -370,6 +378,7 @@ class Config:
         for row in self.starts:
             checks.finite("starts", row)
         checks.pairs("circles", self.circles or ())
+        checks.choice("data_control", self.data_control, DATA_CONTROLS)
         for deviation in self.start_std:
             checks.check_range("start_std", deviation, 0)
         checks.check_range("success", self.success, 0, open_low=True)

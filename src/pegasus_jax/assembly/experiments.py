@@ -36,11 +36,13 @@ def compose(
     searcher: PolicyOptimizer | None = None,
     cost: Cost | Callable[[Array], Array] | None = None,
     mesh: Mesh | None = None,
+    logged: int = 0,
 ) -> Experiment:
     """The experiment of a config on any task, with pieces of your own in place of the configured or the task's ones.
 
     A `cost` may be a function of one state x [D] and, by these names, of u, previous_u, t, reference, goal. A
     `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
+    There is room for `logged` rows of data besides those of the trials.
     With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
     does not suit the config: a cost without a width, for example, needs `search.cost_width_start=1`.
     """
@@ -67,7 +69,7 @@ def compose(
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
         compare=config.successor == "better",
-        capacity=config.trials * task.horizon,
+        capacity=config.trials * task.horizon + logged,
     )
 
 

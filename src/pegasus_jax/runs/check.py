@@ -10,6 +10,7 @@ from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math.circles import entries
+from pegasus_jax.runs.logged import read_config
 from pegasus_jax.tasks import cost_check, user_code
 from pegasus_jax.types import Task
 
@@ -129,6 +130,7 @@ def report(config: Config) -> list[str]:
     asked, config = config, tasks.resolve(config)
     task = build(replace(config, seed=0)).task
     notes = circles_found(asked, config) + before_training(config, task, 1 if given else RESETS)
+    notes += read_config(config, task)[1]
     start = jnp.asarray(task.start_mean, float)
     facts: dict[str, Any] = {
         "task": " ".join([config.task, *([task.name] if task.name != config.task else [])]),

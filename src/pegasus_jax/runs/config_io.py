@@ -19,6 +19,7 @@ from pegasus_jax.runs.removed import refuse, today
 
 # Keys that select what a command begins with, and what they select from.
 NAMED: dict[str, Any] = {"task": TASKS, **WORDS}
+FILES = ("data",)  # settings of files and patterns: one, or a list of them; * means something else in YAML
 
 
 def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, str], dict[str, str]]:
@@ -199,6 +200,9 @@ def _hint(key: str, choices: Sequence[str]) -> str:
 
 
 def _value(key: str, text: str) -> Any:
+    if key in FILES:
+        inner = text[1:-1] if text.startswith("[") and text.endswith("]") else text
+        return [name.strip() for name in inner.split(",") if name.strip()]
     try:
         return OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]))["value"]  # type: ignore[index,call-overload]
     except Exception as error:

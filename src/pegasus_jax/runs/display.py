@@ -203,6 +203,8 @@ def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
 
 def executed(rows: Sequence[dict[str, Any]]) -> str:
     """Whose episode a trial's was: `policy` is the trial that learned the executed policy, 0 for random controls."""
+    if "logs" in rows[0]:
+        return f"{rows[0]['logs']} episodes of logs, {rows[0]['log_seconds']:g} s"
     policies = {row.get("policy", 0 if row["random"] else row["trial"] - 1) for row in rows}
     if policies == {0}:
         return "episode of random controls"

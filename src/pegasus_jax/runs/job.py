@@ -11,12 +11,13 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from pegasus_jax import tasks
-from pegasus_jax.assembly.experiments import build, set_precision
+from pegasus_jax.assembly.experiments import build, compose, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.learn.data import grow
 from pegasus_jax.runs import restore, writers
 from pegasus_jax.runs.display import Display
+from pegasus_jax.runs.logged import NONE, Logs
 from pegasus_jax.runs.programs import Program, is_main_process
 from pegasus_jax.runs.writers import Writer
 from pegasus_jax.types import RunState
@@ -31,6 +32,7 @@ class Job(NamedTuple):
     program: Program
     display: Display
     writer: Writer
+    logs: Logs = NONE  # trial 1 of a run that has some
 
     def random(self, trial: int) -> bool:
         """Whether the episode of this trial is of random controls."""
@@ -38,19 +40,21 @@ class Job(NamedTuple):
 
 
 @contextmanager
-def opened(config: Config, seeds: Sequence[int], mesh: Mesh | None = None) -> Iterator[Job]:
+def opened(config: Config, seeds: Sequence[int], mesh: Mesh | None = None, logs: Logs = NONE) -> Iterator[Job]:
     """A job whose display is up and whose environment is closed afterwards. It writes nothing until told where.
 
     JAX has the config's precision from here on.
     """
     set_precision(config)
     experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
+    if logs.rows:
+        experiment = compose(config, experiment.task, mesh=mesh, logged=logs.rows)
     try:
         program = Program(experiment, config.search.steps, len(seeds), mesh)
         display = Display(config.trials, quiet=not is_main_process())
         with display.running():
             program.on_compile = display.compiling
-            yield Job(config, seeds, experiment, program, display, writers.nothing(len(seeds)))
+            yield Job(config, seeds, experiment, program, display, writers.nothing(len(seeds)), logs)
     finally:
         tasks.close(experiment.task)
 
@@ -72,7 +76,7 @@ def first_states(job: Job, stored: RunState | None = None, changed: bool = False
         states = restore.suited(stored, job.program("init", keys))
     else:
         states = stored
-    room = config.trials * job.experiment.task.horizon
+    room = config.trials * job.experiment.task.horizon + job.logs.rows
     if room > states.data.x.shape[1]:
         states = states._replace(data=jax.vmap(partial(grow, capacity=room))(states.data))
     return states

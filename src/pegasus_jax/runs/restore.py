@@ -23,7 +23,7 @@ from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
 from pegasus_jax.episode import verdict
 from pegasus_jax.experiment import Experiment
-from pegasus_jax.runs import checkpoint, config_io, facts, store
+from pegasus_jax.runs import checkpoint, config_io, facts, logged, store
 from pegasus_jax.types import RunState, Task, TrainState
 
 Trial = int | str  # a number, or one of:
@@ -38,7 +38,7 @@ def restored(run: Path, trial: Trial = LAST, task: Task | None = None) -> tuple[
     """
     config = config_io.load(store.existing(run) / "config.yaml")
     with precision(config):
-        experiment = compose(config, task or store.task_of(run))
+        experiment = compose(config, task or store.task_of(run), logged=logged.of_run(config, run).rows)
         like = jax.eval_shape(experiment.init, jax.random.key(0))
         return config, experiment, _state(run, trial, like)
 

@@ -4,7 +4,7 @@ A command speaks before JAX is there, so whatever imports JAX is imported where 
 """
 
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -57,6 +57,7 @@ def train(
     seeds: int = 1,
     final: bool = False,
     mesh: Mesh = None,
+    data: str | Sequence[str] | None = None,
 ) -> Path:
     """Learn what `pegasus-train` would, by the same loop and with the same files; returns the run's folder.
 
@@ -67,12 +68,14 @@ def train(
     cost: of a gym's or an mjcf's task a function of one observation, instead of the setting cost="module:function"
     seeds: so many, from config.seed on, as one program
     final: whether the last policy runs for one more episode
+    data: files or patterns of logs that the run begins with, as the setting `data`
     mesh: the devices that share seeds and particles (sharding.py); None: as many as share the seeds evenly
 
     Raises ConfigError for what cannot be, and RunError where a run cannot go on. JAX has the config's precision while
     it runs; its devices are the caller's.
     """
-    given = dict(settings or {}) | ({} if cost is None else {"cost": cost})
+    named = {"cost": cost, "data": data}
+    given = dict(settings or {}) | {name: value for name, value in named.items() if value is not None}
     if resume is None:
         asked = new(_config_of(config, given), out, seeds)
     elif config is None and out is None:
@@ -148,36 +151,42 @@ def start(asked: Asked, command: str, configure: Callable[[], Mesh]) -> None:
 
     if is_main_process():
         print(display.devices(), flush=True)
-    config = _checked(asked, mesh)
+    config, logs = _checked(asked, mesh)
     if asked.resumed is None and is_main_process():
         if store.seeds_of(asked.home):
             free = store.free(asked.home)
             raise ConfigError(f"out={asked.home} holds runs already; resume={asked.home} goes on, out={free} is free")
         for run in asked.runs.values():
             store.create(run)
-    train_seeds(config, asked.runs, resume=asked.resumed is not None, command=command, final=asked.final, mesh=mesh)
+    told: dict[str, Any] = dict(command=command, final=asked.final, mesh=mesh, logs=logs)
+    train_seeds(config, asked.runs, resume=asked.resumed is not None, **told)
     if is_main_process():
         _summed_up(asked)
 
 
-def _checked(asked: Asked, mesh: Mesh) -> Config:
-    """The config with all that is known of its task. Impossible settings end here, before anything is written."""
+def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
+    """(the config with all that is known of its task, the logs of a new run).
+
+    Impossible settings and logs end here, before anything is written.
+    """
     from pegasus_jax.assembly.experiments import build
     from pegasus_jax.runs import restore
     from pegasus_jax.runs.check import RESETS, before_training, circles_found
+    from pegasus_jax.runs.logged import read_config
     from pegasus_jax.tasks import resolve
 
     if asked.resumed is not None:
         config = restore.moved(asked.resumed, asked.config, asked.mjcf)
         restore.announce(asked.resumed, config)
         build(replace(config, seed=0), mesh)
-        return config
+        return config, None
     config = resolve(asked.config)
     task = build(replace(config, seed=0), mesh).task
     resets = 1 if asked.config.start_mean else RESETS  # who says where episodes start has nobody reset a robot
-    for note in circles_found(asked.config, config) + before_training(config, task, resets):
+    logs, notes = read_config(config, task)
+    for note in circles_found(asked.config, config) + before_training(config, task, resets) + notes:
         print(f"note: {note}", file=sys.stderr)
-    return config
+    return config, logs
 
 
 def _summed_up(asked: Asked) -> None:

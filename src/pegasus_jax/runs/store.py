@@ -6,6 +6,8 @@
                              ran, names, dt; written before anything else happens to it. Where x has angles for
                              the cosines and sines that its user observes, also observation [L+1, O] and circles;
                              of a controller that remembers, memory [M] at the start
+        logged/0001.npz      episodes of logs, which are trial 1: as those of the run, with the `source` of each; all
+                             are there before config.yaml is
         imagined/0001.npz    particles after trial 1: x [H+1, K, D], u [H, K, U], cost [H, K]
         trials.jsonl         one JSON object a trial
         checkpoints/0001/    the state after trial 1, with 0001.json: the SHA-256 of each of its files
@@ -39,12 +41,13 @@ if TYPE_CHECKING:  # JAX is imported where it is needed: a command names its fol
     from pegasus_jax.types import Rollout, Task, Trajectory
 
 FILES = ("config.yaml", "run.json", "trials.jsonl", ".lock")
-FOLDERS = ("episodes", "imagined", "checkpoints", "tensorboard", "plots")
+FOLDERS = ("episodes", "logged", "imagined", "checkpoints", "tensorboard", "plots")
 # What a killed process was writing (files.beside, orbax), and pegasus-play.
 UNFINISHED = re.compile(
     r"\.(\d{4,}\.(npz|json)|trials\.jsonl|run\.json|config\.yaml|learning\.png|trial_\d{4,}\.png)"
     r"\.\w{8}|\.play\.\w{8}|\d{4,}\.orbax-checkpoint-tmp.*"
 )
+EPISODE = ("x", "u", "cost", "task", "trial", "policy", "ended", "horizon")  # what every episode's file has
 ENDED = ("horizon", "terminated", "truncated", "error", "interrupted")  # how an episode can end
 # What a row of trials.jsonl says in numbers, and readers of it use.
 COLUMNS = ("plant_seconds", "episode_cost", "mean_cost", "success_rate", "objective_last", "objective_fresh")
@@ -152,7 +155,12 @@ def save_episode(run: Path, trial: int, episode: Trajectory, task: Task, *, poli
 def episode_arrays(
     run: Path, trial: int, episode: Trajectory, task: Task, *, policy: int, ended: str
 ) -> dict[str, Any]:
-    """What the file of an episode holds, by name."""
+    """What the file of an episode of a run holds, by name."""
+    return arrays_of(task_of(run).name, trial, episode, task, policy=policy, ended=ended)
+
+
+def arrays_of(name: str, trial: int, episode: Trajectory, task: Task, *, policy: int, ended: str) -> dict[str, Any]:
+    """What the file of an episode holds, by name; `name` is the task's, as its run began with it."""
     length = len(episode.u) if episode.length is None else int(episode.length)
     arrays: dict[str, Any] = {} if episode.memory is None else dict(memory=np.asarray(episode.memory))
     arrays |= dict(
@@ -161,7 +169,7 @@ def episode_arrays(
     known = dict(state_names=task.state_names, control_names=task.control_names, dt=task.dt, horizon=task.horizon)
     if task.circles:  # x has angles for some of its cosines and sines
         known |= dict(observation=to_observation(arrays["x"], task.circles), circles=task.circles)
-    known |= dict(task=task_of(run).name, trial=trial, policy=policy, ended=ended)
+    known |= dict(task=name, trial=trial, policy=policy, ended=ended)
     return arrays | known
 
 
@@ -190,13 +198,13 @@ def _episode(run: Path, trial: int) -> dict[str, Any] | None:
     path = episode_path(run, trial)
     if not path.exists():
         return None
-    found = arrays(path, "x", "u", "cost", "task", "trial", "policy", "ended", "horizon")
-    if wrong := _wrong(found, trial, task_of(run)):
-        raise RunError(f"{path} {wrong}")
+    found = arrays(path, *EPISODE)
+    if what := wrong(found, trial, task_of(run)):
+        raise RunError(f"{path} {what}")
     return found
 
 
-def _wrong(found: dict[str, np.ndarray], trial: int, task: Task) -> str | None:
+def wrong(found: dict[str, np.ndarray], trial: int, task: Task) -> str | None:
     """What of an episode's arrays cannot be, or None."""
     x, u, cost = (found[name] for name in ("x", "u", "cost"))
     for name, kinds in (("trial", "iu"), ("policy", "iu"), ("horizon", "iu"), ("task", "U"), ("ended", "U")):

@@ -11,7 +11,7 @@ import numpy as np
 from pegasus_jax import sharding
 from pegasus_jax.checks import SIZES, ConfigError
 from pegasus_jax.config import Config
-from pegasus_jax.runs import config_io, writers
+from pegasus_jax.runs import config_io, logged, writers
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.job import first_states, opened
 from pegasus_jax.runs.train import learn
@@ -42,7 +42,8 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
         if path is not None:
             write(path, result)
 
-    with opened(config, seeds, sharding.evenly(len(seeds))) as job:
+    logs = logged.of_config(config)
+    with opened(config, seeds, sharding.evenly(len(seeds)), logs) as job:
         job = job._replace(writer=one_json(config, seeds, job.experiment.task, keep))
         learn(job, first_states(job))
     return result
@@ -74,7 +75,7 @@ def curves(config: Config, seeds: list[int], trials: list[list[Row]], task: Task
 
     return {
         "seeds": seeds,
-        "plant_seconds": np.round(task.horizon * task.dt * np.arange(1, len(trials) + 1), 6).tolist(),
+        "plant_seconds": np.round(task.horizon * task.dt * (np.arange(len(trials)) + (not config.data)), 6).tolist(),
         **{name: rounded(of(name)) for name in ROUNDED},
         "success_rate": of("success_rate"),
         "skipped_updates": of("skipped_updates"),

@@ -4,6 +4,7 @@ Whatever is learned goes to a `Writer` (writers.py): `train` keeps a folder per 
 (runs/study.py) one JSON of all seeds.
 """
 
+from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,8 @@ from pegasus_jax import episode
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import EVALUATE, trial_key
-from pegasus_jax.runs import checkpoint, config_io, restore, store, writers
+from pegasus_jax.logs.read import Logged
+from pegasus_jax.runs import checkpoint, config_io, logged, restore, store, writers
 from pegasus_jax.runs.collect import collected, stacked
 from pegasus_jax.runs.display import summary
 from pegasus_jax.runs.evaluation import evaluate, saturated
@@ -60,13 +62,15 @@ def train_seeds(
     command: str = "",
     final: bool = False,
     mesh: Mesh | None = None,
+    logs: Sequence[Logged] | None = None,
 ) -> RunState:
     """`train` for the seeds and folders of `runs`, all as one program; returns their states [S, ...].
 
     Each folder is what a run of that seed alone would leave, and can be resumed alone. The seeds share nothing but the
     clock: one that diverges leaves the others as they are. All go on from the newest trial that all have finished.
     With a `mesh` (sharding.py) of several devices the seeds are shared out among them; where several processes hold the
-    devices, all call this together, see the same files, and the first one writes.
+    devices, all call this together, see the same files, and the first one writes. `logs` are the episodes of the
+    config's `data`, None where they are to be read; a run that goes on has copies of them.
     """
     folders = list(runs.values())
     with ExitStack() as held:
@@ -76,8 +80,11 @@ def train_seeds(
         before = config_io.load(folders[0] / "config.yaml") if resume else config
         if config.trials < before.trials:
             raise ConfigError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
-        job = held.enter_context(opened(config, list(runs), mesh))
+        begun = logged.of_run(config, folders[0]) if resume else logged.of_config(config, logs)
+        job = held.enter_context(opened(config, list(runs), mesh, begun))
         task, say = job.experiment.task, job.display.line
+        for run in folders if begun.rows and not resume and is_main_process() else ():
+            logged.save(run, begun.episodes(), task)
         for run in folders if resume else ():
             restore.same(run, task)
         stored = restore.together(folders, job.experiment, say) if resume else None
@@ -106,12 +113,36 @@ def learn(job: Job, states: RunState, done: int = 0) -> RunState:
         job.writer.trial(trial, states, rows)
         for line in (summary(rows, job.config.trials), *stuck(before, rows)):
             job.display.line(line)
-        before = rows
+        before = [] if "logs" in rows[0] else rows
     return states
+
+
+def of_logs(job: Job, states: RunState) -> tuple[RunState, list[Row]]:
+    """Trial 1 of a run that begins with logs: they become data, then all goes on as after an episode."""
+    config, task, program = job.config, job.experiment.task, job.program
+    job.display.phase(1, "read")
+    logs = job.logs.episodes()
+    states, found = logged.added(states, logs, job.experiment), [UNKNOWN] * len(job.seeds)
+    if config.explore.trials < 2:
+        states, found = improved(job, states, 1)
+    evaluation = evaluated(job, states, 1)
+    own = {"trial": 1, "plant_seconds": 0.0, "random": False, "policy": 0, **logged.told(logs, task)}
+    controls = np.concatenate([one.trajectory.u for one in logs])
+    rest = {"saturated": float(saturated(controls, task)), "calibration": None, "seconds": program.seconds()}
+    return states, [{**own, **measured, **learned, **rest} for measured, learned in zip(evaluation, found, strict=True)]
+
+
+def evaluated(job: Job, states: RunState, trial: int) -> list[Row]:
+    """What the policies [S] are worth after a trial, by episodes that are not data."""
+    job.display.phase(trial, "evaluate", 0.9)
+    keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(gather(states.key))
+    return evaluate(keys, states.policy.params, job.experiment.task, job.program, job.config.eval_episodes)
 
 
 def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Row]]:
     """One round of Alg. 1 for every seed, then the evaluation; a row a seed says how it went."""
+    if trial == 1 and job.logs.rows:
+        return of_logs(job, states)
     config, task, program = job.config, job.experiment.task, job.program
     # Line 3: run the policy on the plant.
     episodes, policies = collected(job, states, trial)
@@ -124,14 +155,12 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Ro
     # Lines 5 and 6: fit the model, search a policy; not where the next episode is random too, and needs no policy.
     if trial >= config.explore.trials:
         states, found = improved(job, states, trial, trajectories)
-    job.display.phase(trial, "evaluate", 0.9)
-    keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(gather(states.key))
-    evaluation = evaluate(keys, states.policy.params, task, program, config.eval_episodes)
+    evaluation = evaluated(job, states, trial)
     sizes, seconds = np.asarray(gather(states.data.size)), program.seconds()
     return states, [
         {
             "trial": trial,
-            "plant_seconds": round(int(sizes[index]) * task.dt, 6),
+            "plant_seconds": round((int(sizes[index]) - job.logs.rows) * task.dt, 6),
             "random": job.random(trial),
             "policy": int(policies[index]),
             **episode.verdict(ran, task),
@@ -147,7 +176,9 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Ro
     ]
 
 
-def improved(job: Job, states: RunState, trial: int, trajectories: Trajectory) -> tuple[RunState, list[Row]]:
+def improved(
+    job: Job, states: RunState, trial: int, trajectories: Trajectory | None = None
+) -> tuple[RunState, list[Row]]:
     """Fit, search, and imagine what comes (lines 5 and 6 of Alg. 1); how it went, of each seed.
 
     Where no seed's model, or no seed's policy, could learn anything, the writer is told.
@@ -167,7 +198,8 @@ def improved(job: Job, states: RunState, trial: int, trajectories: Trajectory) -
         states, searched = program("search", states, jnp.int32(i * program.chunk))
         found.append(jax.tree.map(np.asarray, gather(searched)))
         program.prepare("succeed", incumbents)  # once; not before the first of the search, for which everybody waits
-        program.prepare("calibrate", trajectories)
+        if trajectories is not None:
+            program.prepare("calibrate", trajectories)
     objective, norm = (np.concatenate([getattr(f, name) for f in found], 1) for name in ("objective", "gradient_norm"))
     if not np.any(np.isfinite(objective) & np.isfinite(norm)):
         lost = "the imagined cost or its gradient is not finite in any iteration"

@@ -1,0 +1,1 @@
+"""Data that its user already has: files of earlier episodes, as episodes of a task."""

@@ -1,0 +1,173 @@
+"""A table cut into episodes, checked, and brought to the task's control period."""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.logs.columns import SETTING, Column, Layout, numbers
+from pegasus_jax.logs.table import Table, names_of
+from pegasus_jax.math.circles import to_state
+from pegasus_jax.memory import measured
+from pegasus_jax.types import Task
+
+JITTER = 0.05  # of a period, by which rows may come early or late without being interpolated
+GAP = 3.0  # periods without a row that end an episode
+RARE = 5.0  # control periods from row to row that no interpolation fills
+ROUNDING = 1e-3  # of a control's range, by which a file's numbers may be beyond it
+ROUND = 0.1  # by which a cosine and a sine may miss the unit circle
+TURNS = 4 * np.pi  # [rad] an angle at the start of an episode that is greater must be in degrees
+
+Note = Callable[[str], None]
+
+
+class Segment(NamedTuple):
+    """Rows of one episode that follow each other without a gap."""
+
+    t: np.ndarray  # [L+1] [s]
+    x: np.ndarray  # [L+1, D] states, as far as they are measured
+    u: np.ndarray  # [L, U] what was sent at the times 0..L-1
+
+
+def segments(table: Table, where: Layout, task: Task, control: str, note: Note) -> Iterator[Segment]:
+    """The episodes of a table, apart where its `episode` changes, its time goes back, or something is missing.
+
+    With `control` "before" a row's controls are those sent before it, else at its time. Raises ConfigError, with the
+    row, for what cannot be an episode of the task. `note` hears of everything that was decided.
+    """
+    observed = np.column_stack([numbers(table, column) for column in where.observation])
+    sent = np.column_stack([numbers(table, column) for column in where.control])
+    t = np.arange(len(observed)) * task.dt if where.time is None else numbers(table, where.time)
+    for row in np.flatnonzero(~np.isfinite(t)):
+        raise ConfigError(f"{table.where(row)}: its time is missing")
+    if where.time is None:
+        note(f"no column t or time: rows are taken to be dt={task.dt:g} s apart")
+    _within_limits(table, sent, where, task)
+    begins = np.diff(t) < 0
+    if where.episode is not None:
+        begins |= np.diff(numbers(table, Column(where.episode))) != 0
+    for rows in np.split(np.arange(len(t)), np.flatnonzero(begins) + 1):
+        if len(rows) > 1:
+            u = sent[rows] if control == "sent" else np.vstack([sent[rows[1:]], np.full_like(sent[:1], np.nan)])
+            _radians(table, rows, observed[rows], where, task)
+            cuts = _cuts(table, rows, t[rows], (observed[rows], u), task, note)
+            for part in np.split(np.arange(len(rows)), cuts):
+                if len(part) > 1:
+                    yield Segment(t[rows][part], to_state(observed[rows][part], task.circles), u[part[:-1]])
+
+
+def _cuts(
+    table: Table, rows: np.ndarray, t: np.ndarray, seen: tuple[np.ndarray, np.ndarray], task: Task, note: Note
+) -> np.ndarray:
+    """Where an episode is cut: before the rows at which time has jumped, and around those that lack numbers."""
+    steps = np.diff(t)
+    for i in np.flatnonzero(steps <= 0):
+        raise ConfigError(f"{table.where(rows[i + 1])}: time stands still at {t[i]:g} s")
+    usual = float(np.median(steps))
+    if usual > RARE * task.dt:
+        raise ConfigError(
+            f"{table.where(rows[0])}: a row every {usual:g} s is too rare for dt={task.dt:g}; in other units?"
+            f" {SETTING}=[t=COLUMN*0.001,...] makes seconds of milliseconds"
+        )
+    whole: np.ndarray = np.all(np.isfinite(seen[0]), axis=1)
+    known: np.ndarray = np.all(np.isfinite(seen[1]), axis=1)
+    gaps = steps > GAP * max(usual, task.dt)
+    for i in np.flatnonzero(gaps)[:1]:
+        note(f"{table.unit} {table.lines[rows[i + 1]]} comes {steps[i]:.3g} s after the one before it; cut there")
+    unsent = whole & ~known
+    unsent[-1] = False  # nothing follows from the last one
+    for bad, what in ((~whole, "observation"), (unsent, "control")):
+        if bad.any():
+            first = table.lines[rows[np.argmax(bad)]]
+            note(f"{table.unit} {first} lacks a number of the {what} ({bad.sum()} such rows); cut there")
+    return np.flatnonzero(gaps | ~whole[1:] | ~whole[:-1] | ~known[:-1]) + 1
+
+
+def _radians(table: Table, rows: np.ndarray, observed: np.ndarray, where: Layout, task: Task) -> None:
+    """Raises ConfigError for an angle that cannot be in radians, and for a pair that is no cosine and sine."""
+    for pair in task.circles:
+        radius = np.hypot(*observed[:, pair].T)
+        for row in np.flatnonzero(np.abs(radius - 1) > ROUND)[:1]:
+            names = " and ".join(where.observation[entry].name for entry in pair)
+            raise ConfigError(
+                f"{table.where(rows[row])}: {names} are no cosine and sine of an angle: the root of the sum of their"
+                f" squares is {radius[row]:.3g}"
+            )
+    for entry in np.flatnonzero(names_of(task).turning):
+        angle = observed[:, entry]
+        jumps = np.abs(np.diff(angle))
+        odd = (jumps > np.pi) & (np.abs(jumps - 2 * np.pi) > np.pi / 2)  # neither a move nor a seam at 180 degrees
+        odd &= np.abs(angle[1:]) > TURNS
+        first = [0] if np.abs(angle[0]) > TURNS else [*(np.flatnonzero(odd) + 1)]
+        for row in first[:1]:
+            name = where.observation[entry].name
+            raise ConfigError(
+                f"{table.where(rows[row])}: {name} is {angle[row]:g}, which looks like degrees; angles are in radians:"
+                f" {SETTING}=[...] may say {name}*0.0174533"
+            )
+
+
+def _within_limits(table: Table, sent: np.ndarray, where: Layout, task: Task) -> None:
+    """Clips what rounding left beyond the limits. Raises ConfigError for controls [N, U] that really are beyond."""
+    low, high = np.asarray(task.control_low, float), np.asarray(task.control_high, float)
+    slack = ROUNDING * (high - low)
+    for row, i in np.argwhere((sent < low - slack) | (sent > high + slack))[:1]:
+        raise ConfigError(
+            f"{table.where(row)}: {where.control[i].name} is {sent[row, i]:g}, beyond its limits {low[i]:g} to"
+            f" {high[i]:g}"
+        )
+    np.clip(sent, low, high, out=sent)
+
+
+def periods(one: Segment, task: Task, note: Note) -> Segment:
+    """The segment at the task's control period.
+
+    As it is where its rows come a period apart. Else states are interpolated linearly, angles the shorter way, and
+    controls are held.
+    """
+    steps = np.diff(one.t)
+    if np.abs(steps / task.dt - 1).max() <= JITTER:
+        return one
+    slack = 1e-3 * task.dt
+    count = int((one.t[-1] - one.t[0] + slack) / task.dt)
+    grid = one.t[0] + task.dt * np.arange(count + 1)
+    turning = [i in task.angles for i in measured(task)]
+    x = np.column_stack([interpolated(grid, one.t, *pair) for pair in zip(one.x.T, turning, strict=True)])
+    held = np.searchsorted(one.t, grid[:-1] + slack, side="right") - 1
+    within = np.minimum((one.t[:-1] - one.t[0] + slack) // task.dt, count - 1).astype(int)  # the period of each row
+    note(f"a row every {np.median(steps):.3g} s or so: resampled to dt={task.dt:g}")
+    if np.any(one.u != one.u[held][within]):
+        note(f"controls change within periods of dt={task.dt:g}; those at their beginning are taken")
+    return Segment(grid, x, one.u[held])
+
+
+def with_rates(x: np.ndarray, task: Task) -> np.ndarray:
+    """States [L+1, D] of what is measured of them; their rates are differences from row to row."""
+    places = list(measured(task))
+    if len(places) == len(task.state_names):
+        return x
+    whole = np.zeros((len(x), len(task.state_names)))
+    whole[:, places] = x
+    coordinates = [i for i in range(len(task.state_names)) if i not in task.rates]
+    for i, rate in zip(coordinates, task.rates, strict=True):
+        change = np.diff(whole[:, i])
+        change = np.arctan2(np.sin(change), np.cos(change)) if i in task.angles else change
+        whole[1:, rate] = change / task.dt
+    whole[0] = np.where(np.isin(np.arange(len(task.state_names)), task.rates), whole[1], whole[0])
+    return whole
+
+
+def interpolated(
+    grid: np.ndarray, t: np.ndarray, values: np.ndarray, turning: bool, turn: float = 2 * np.pi
+) -> np.ndarray:
+    """Values at the times `grid`, linear between those at t; NaN outside. An angle's keep to the range that it had.
+
+    `turn` is a whole turn in the values' unit.
+    """
+    straight = np.unwrap(values, period=turn) if turning else values
+    found = np.interp(grid, t, straight, left=np.nan, right=np.nan)
+    if np.array_equal(straight, values):
+        return found
+    low = -turn / 2 if values.min() < 0 else 0.0
+    return (found - low) % turn + low
