@@ -169,6 +169,9 @@ def test_the_method_has_few_settings():
         "start_std",
         "starts",
         "success",
+        "prior",
+        "init",
+        "init_parts",
     }
     assert [field.name for field in dataclasses.fields(Config)][-len(plant) :] == [*config_io.used_by()]
 

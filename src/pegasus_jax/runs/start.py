@@ -89,7 +89,7 @@ def _config_of(config: Config | str | None, given: dict[str, Any]) -> Config:
 
     if isinstance(config, Config):
         config_io.check_used(config.task, given)
-        return config_io.override(config, config_io.values(given))
+        return config_io.override(config, config_io.values(config_io.without_random(given)))
     return preset(config or "cartpole", settings=given)
 
 
@@ -175,7 +175,9 @@ def _checked(asked: Asked, mesh: Mesh) -> Config:
     config = resolve(asked.config)
     task = build(replace(config, seed=0), mesh).task
     resets = 1 if asked.config.start_mean else RESETS  # who says where episodes start has nobody reset a robot
-    for note in circles_found(asked.config, config) + before_training(config, task, resets):
+    from pegasus_jax.runs.begin import checked
+
+    for note in checked(config, task) + circles_found(asked.config, config) + before_training(config, task, resets):
         print(f"note: {note}", file=sys.stderr)
     return config
 
