@@ -177,6 +177,9 @@ def test_the_method_has_few_settings():
         "data",
         "data_columns",
         "data_control",
+        "prior",
+        "init",
+        "init_parts",
     }
     fields = [*dict.fromkeys(name.partition(".")[0] for name in config_io.used_by())]
     assert [field.name for field in dataclasses.fields(Config)][-len(fields) :] == fields

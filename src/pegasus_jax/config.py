@@ -20,6 +20,7 @@ MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe
 TASKS = ("cartpole", "double_cartpole", *(f"swimmer_{maneuver}" for maneuver in MANEUVERS), GYM, MJCF)
 OWN = (GYM, MJCF)
 EVERY = ("*",)
+CONSTANTS = (GYM, "cartpole", "double_cartpole")  # the tasks that have `env_args`
 
 SQUASHES = ("tanh", "sine")
 EXPLORATIONS = ("uniform", "walk")
@@ -27,6 +28,7 @@ MATCHINGS = ("always", "narrow", "never")
 COST_ESTIMATORS = ("gaussian", "particles")
 OBSERVATION_NOISES = ("model", "plant")
 VELOCITIES = ("none", "difference", "filter")
+INIT_PARTS = ("policy", "model")
 INITS = ("previous", "better", "fresh")
 LEGS = (2, 6)
 SUCCESSORS = ("always", "better")
@@ -333,7 +335,7 @@ class Config:
         None, "control period [s]; null: a gym's own. A whole number of an mjcf's time steps", OWN
     )
     env_args: tuple[str, ...] = setting(
-        (), "the environment's own arguments, each as env_args.port=/dev/ttyACM0", (GYM,)
+        (), "arguments of its own, each as env_args.port=/dev/ttyACM0; of a cart-pole env_args.pole_mass=0.4", CONSTANTS
     )
     state_names: tuple[str, ...] = setting(
         (),
@@ -365,9 +367,22 @@ class Config:
         (), "their columns: the observation's, the controls'; NAME=COLUMN*FACTOR; []: by name, else in order", ("*",)
     )
     data_control: str = setting("sent", "their controls are those sent at a row's time, or before: to reach it", ("*",))
+    prior: str | Callable | None = setting(  # noqa: RUF009 (frozen)
+        None,
+        "a simulator of the plant: module:function, (x [D], u [U]) -> x a period later, in JAX; or an MJCF file",
+        EVERY,
+    )
+    init: str | None = setting(
+        None, "RUN, or RUN@TRIAL: another run with which this one begins, maybe of a simulator", EVERY
+    )
+    init_parts: tuple[str, ...] = setting(("policy",), "what is taken from there: policy, model", EVERY)
 
     def __post_init__(self) -> None:
         checks.typed("", self)
+        if self.init in INITS:
+            raise ConfigError(f"init={self.init} is no run; search.init={self.init} is what a search starts from")
+        for part in self.init_parts:
+            checks.choice("init_parts", part, INIT_PARTS)
         checks.choice("legs", self.legs, LEGS)
         checks.choice("successor", self.successor, SUCCESSORS)
         checks.check_range("stop_cost", self.stop_cost, 0)
@@ -405,6 +420,16 @@ KINDS: dict[str, dict[str, Any]] = {
     "fit": {"adam": Fit(), "lbfgs": LBFGS()},
     "search": {"particles": Search(), "analytic": Analytic()},
 }
+
+
+def first_search(config: Config) -> int:
+    """The trial after which a policy is searched for the first time; 0: before the first episode."""
+    return max(config.explore.trials, 0 if config.prior is not None else 1)  # a simulator needs no episode
+
+
+def begins_with_policy(config: Config) -> bool:
+    """Whether a run begins with a policy that has learned already, in another run."""
+    return config.init is not None and "policy" in config.init_parts
 
 
 def label(config: Config) -> str:

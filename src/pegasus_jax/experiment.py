@@ -97,16 +97,19 @@ def experiment(
     remember: Callable[[Any, RunState], Any] | None = None,
     explore: Callable[[Key], Array],
     explore_trials: int,
+    first_search: int,
+    begun: bool = False,
     compare: bool,
     capacity: int,
 ) -> Experiment:
     """Compose the pieces into an `Experiment`. Every function of it is pure and can be jitted, vmapped, scanned.
 
     `imagine(key, policy parameters, posterior)` rolls out fresh scenarios -> (rollout, cost [H, K]), and `expect` says
-    what a policy costs a step; None: the mean of that. With `compare` a policy whose newest episode succeeded is
-    followed only by one that is expected to cost less. `remember(posterior, state)` is what all of them are given in a
-    posterior's place. With an environment instead of a plant in JAX, `episode` and `collect` are not pure, and `drive`
-    is there.
+    what a policy costs a step; None: the mean of that. `first_search` is the trial after which a policy is searched for
+    the first time; 0: before the first episode. One that is `begun` has learned elsewhere before that. With `compare` a
+    policy whose newest episode succeeded is followed only by one that is expected to cost less.
+    `remember(posterior, state)` is what all of them are given in a posterior's place. With an environment instead of a
+    plant in JAX, `episode` and `collect` are not pure, and `drive` is there.
     """
     states, controls, memory = len(task.state_names), len(task.control_names), task.memory
     see, given, advance = recall.steps(memory)
@@ -233,18 +236,19 @@ def experiment(
         key = trial_key(state.key, state.trial, SEARCH)
         posterior = posterior_of(state)
 
-        explored = max(1, explore_trials)
         # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
         # that knows nothing is the better start.
         fresh = adapted(policy.init(trial_key(state.key, state.trial, RESTART)), state.data)
-        untrained = (state.trial <= explored) & (first == 0)
-        given = optax.tree.where(untrained, adapted(state.policy.params, state.data), state.policy.params)
+        untrained = (state.trial <= first_search) & (first == 0)
+        given = state.policy.params  # one that has learned keeps the inputs that it has learned with
+        if not begun:
+            given = optax.tree.where(untrained, adapted(given, state.data), given)
         learner, info = search.run(
             key,
             state.policy._replace(params=given),
             posterior,
             first=first,
-            earlier=jnp.maximum(state.trial - explored, 0),
+            earlier=jnp.maximum(state.trial - first_search, 0),
             steps=steps,
             fresh=fresh,
         )
@@ -266,7 +270,8 @@ def experiment(
         old, new = jnp.mean(old_cost), jnp.mean(cost)
         if expect is not None:
             old, new = (expect(key, params, posterior) for params in (incumbent, state.policy.params))
-        replaced = (state.policy_trial == 0) | ~state.succeeded | ~(old <= new)
+        unlearned = jnp.bool_(False) if begun else state.policy_trial == 0 if first_search else state.trial == 0
+        replaced = unlearned | ~state.succeeded | ~(old <= new)
         rolled, cost, params = optax.tree.where(
             replaced, (rolled, cost, state.policy.params), (old_rolled, old_cost, incumbent)
         )
@@ -304,7 +309,7 @@ def experiment(
         key = trial_key(state.key, state.trial + 1, CALIBRATE)
         ran, _ = as_modeled(trajectory)
         found = calibration(key, posterior, ran._replace(u=ran.u[:, :inputs]), dynamics=dynamics, angles=task.angles)
-        return jnp.where(state.trial >= max(1, explore_trials), found, jnp.nan)
+        return jnp.where(state.trial >= first_search, found, jnp.nan)
 
     return Experiment(
         task,

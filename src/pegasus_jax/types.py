@@ -173,8 +173,7 @@ class Task(NamedTuple):
     """What is to be learned: a plant's interface, a cost, and where episodes start."""
 
     name: str
-    # reset(key) -> state; step(state, u [U]) -> state; observe(state) -> x [D]. None: `environment`, or somebody else,
-    # supplies the episodes.
+    # reset(key) -> state; step(state, u [U]) -> state; observe(state) -> x [D]. None: others supply the episodes
     plant: Any
     cost: Cost
     angles: tuple[int, ...]  # the dimensions of x that are angles [rad]
@@ -199,6 +198,7 @@ class Task(NamedTuple):
     # Pairs of entries of the user's observation that are cosine and sine of one angle of x (math/circles.py); (): the
     # observation is x.
     circles: tuple[tuple[int, ...], ...] = ()
+    prior: Callable[[Array, Array], Array] | None = None  # a simulator: (x [D], u [U]) -> x [D] one period later
     starts: Any = None  # [N, D] states where episodes start, equally likely; None: N(start_mean, diag(start_std^2))
     starts_std: Any = None  # [D] spread of the starts around these, normal; None: they are used as they are
     memory: Memory = NO_MEMORY

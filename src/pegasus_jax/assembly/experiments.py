@@ -13,6 +13,7 @@ from pegasus_jax.assembly.searchers import limits, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.imagine import visited
+from pegasus_jax.models.residual import on_differences, residual
 from pegasus_jax.sharding import over_particles
 from pegasus_jax.tasks.remembered import remembering
 from pegasus_jax.types import Array, Cost, Dynamics, ModelLearner, Policy, PolicyOptimizer, Task
@@ -48,6 +49,10 @@ def compose(
     """
     task = tasks.whole(remembering(config, task), None if cost is None else as_cost(cost))
     dynamics = dynamics or dynamics_of(config.model, task)
+    fitter = fitter or fit_of(config.fit, dynamics)
+    if task.prior is not None:  # then all of that is of what the simulator gets wrong
+        fitter = on_differences(fitter, task.prior, task.angles)
+        dynamics = residual(dynamics, task.prior, angles=task.angles)
     visits = bool(config.search.visited_starts) and searcher is None
     dynamics = visited.remembering(dynamics) if visits else dynamics
     policy = policy or policy_of(config.policy, task)
@@ -59,7 +64,7 @@ def compose(
         task=task,
         dynamics=dynamics,
         policy=policy,
-        fit=fitter or fit_of(config.fit, dynamics),
+        fit=fitter,
         fit_steps=config.fit.steps,
         search=searcher or searching.searcher,
         search_steps=config.search.steps,
@@ -68,6 +73,8 @@ def compose(
         remember=visited.remember if visits else None,
         explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
         explore_trials=explore.trials,
+        first_search=settings.first_search(config) if task.prior is None else explore.trials,
+        begun=settings.begins_with_policy(config),
         compare=config.successor == "better",
         capacity=config.trials * task.horizon + logged,
     )

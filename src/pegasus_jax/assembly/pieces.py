@@ -17,6 +17,7 @@ from pegasus_jax.models import dropout
 from pegasus_jax.models.bnn import bnn
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.models.lagrangian import lagrangian
+from pegasus_jax.models.networks import HEADS
 from pegasus_jax.models.sharpened import sharpened
 from pegasus_jax.pilco.gp import gp
 from pegasus_jax.pilco.lbfgs import full_data
@@ -47,8 +48,14 @@ def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> ModelLe
 
 def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
     """The configured model of a task's dynamics. Raises ConfigError where the task does not suit it."""
-    controls = given_size(task.memory, len(task.control_names))
-    shape: dict[str, Any] = dict(states=len(task.state_names), controls=controls, angles=task.angles)
+    states, controls = len(task.state_names), given_size(task.memory, len(task.control_names))
+    if task.prior is not None and (task.hindsight is not None or controls != len(task.control_names)):
+        raise ConfigError(
+            "prior= is a step from a whole state, and history= or sensors.velocity= stand for one that is not measured;"
+            " the nearest is without prior="
+        )
+    told = states if task.prior is not None else 0  # what a `residual` is told beside the controls
+    shape: dict[str, Any] = dict(states=states, controls=controls + told, angles=task.angles)
     if task.hindsight is not None and isinstance(config, settings.GP | settings.SSGP):
         raise ConfigError("sensors.velocity= needs a model=lagrangian or another network; the nearest is history=2")
     match config:
@@ -56,11 +63,17 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
             return gp(**shape)
         case settings.SSGP():
             return ssgp(**shape)
+        case settings.Lagrangian() if task.prior is not None:
+            raise ConfigError(
+                "model=lagrangian is a mechanism, and what prior= gets wrong is none; the nearest is model=log_normal"
+            )
         case settings.Lagrangian():
             rates = tasks.rates_of(task)
             member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
         case settings.BNN():
-            member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic)
+            # What a good simulator gets wrong may be all noise.
+            head = HEADS["sigmoid" if task.prior is None else "softplus"]
+            member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic, head=head)
     model = ensemble(member, config.ensemble_size) if config.ensemble_size > 1 else member
     if task.hindsight is None:
         return model

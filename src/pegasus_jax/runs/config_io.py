@@ -43,7 +43,7 @@ def parse(words: Mapping[str, Any], options: Sequence[str] = ()) -> Config:
 
     The words are texts, from Python maybe values.
     """
-    words = _with_arguments(words)
+    words = without_random(_with_arguments(words))
     chosen = {name: words.pop(name) for name in NAMED if name in words}
     for name, value in chosen.items():
         if value not in NAMED[name]:
@@ -100,6 +100,13 @@ def _with_arguments(words: Mapping[str, Any]) -> dict[str, Any]:
     given = [f"{key.removeprefix(prefix)}={value}" for key, value in words.items() if key.startswith(prefix)]
     rest = {key: value for key, value in words.items() if not key.startswith(prefix)}
     return rest | ({"env_args": json.dumps(given)} if given else {})
+
+
+def without_random(words: Mapping[str, Any]) -> dict[str, Any]:
+    """The words, with no random episode unless they ask for some, where there is a first policy or a simulator."""
+    parts = str(words.get("init_parts", "policy"))
+    knows = words.get("prior") not in (None, "null") or (words.get("init") not in (None, "null") and "policy" in parts)
+    return ({"explore.trials": 0} if knows else {}) | dict(words)
 
 
 def values(words: Mapping[str, Any]) -> dict[str, Any]:

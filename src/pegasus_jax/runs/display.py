@@ -202,12 +202,12 @@ def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
 
 
 def executed(rows: Sequence[dict[str, Any]]) -> str:
-    """Whose episode a trial's was: `policy` is the trial that learned the executed policy, 0 for random controls."""
+    """Whose episode a trial's was: `policy` is the trial that learned the executed policy, 0 for what came before."""
     if "logs" in rows[0]:
         return f"{rows[0]['logs']} episodes of logs, {rows[0]['log_seconds']:g} s"
     policies = {row.get("policy", 0 if row["random"] else row["trial"] - 1) for row in rows}
     if policies == {0}:
-        return "episode of random controls"
+        return f"episode of {'random controls' if rows[0]['random'] else 'the first policy'}"
     return f"episode by the policy of trial {policies.pop()}" if len(policies) == 1 else "episodes"
 
 
@@ -226,8 +226,8 @@ def best_line(rows: Sequence[dict[str, Any]], trial: int) -> str:
     """The trial with the best policy of a run, and what its evaluation, or else its own episodes, say of it."""
     if all(row["objective_fresh"] is None for row in rows):
         return "no policy was learned: every episode was of random controls"
-    row = rows[trial - 1]
-    own = [other["episode_cost"] for other in rows if other.get("policy") == trial]
+    row = rows[trial - 1] if trial else {"mean_cost": None}  # 0: the policy that the first episode ran
+    own = [other["episode_cost"] for other in rows if other.get("policy") == trial and (trial or not other["random"])]
     if row["mean_cost"] is not None:
         known = f"success {row['success_rate']:.0%}, cost {row['mean_cost']:.3f}"
     else:

@@ -80,9 +80,14 @@ def best(run: Path) -> int:
     ran, origin = store.load_episode(run, following), store.origin(run, following)
     last = None
     if ran is not None and origin is not None and len(ran.trajectory.u) and np.isfinite(ran.trajectory.cost).all():
-        last = {"policy": origin[0], "ended": ran.ended, **verdict(ran, store.task_of(run))}
+        last = {
+            "policy": origin[0],
+            "random": rows[-1]["random"],
+            "ended": ran.ended,
+            **verdict(ran, store.task_of(run)),
+        }
     try:
-        return store.best_trial(rows, last)
+        return store.best_trial(rows, last, first=0 if 0 in checkpoint.available(run) else 1)
     except (KeyError, TypeError) as error:
         raise RunError(f"{run / 'trials.jsonl'} has rows that this version cannot judge") from error
 
@@ -194,7 +199,8 @@ def same(run: Path, task: Task) -> None:
 def announce(run: Path, config: Config) -> None:
     """Say which modules of their user a config names, and where they are. Raises RunError for one inside the run."""
     inside = run.resolve()
-    names = (config.cost, config.stop, config.goals, *(n for n in (config.env, config.reference) if ":" in str(n)))
+    paths = (config.env, config.reference, config.prior)
+    names = (config.cost, config.stop, config.goals, *(name for name in paths if ":" in str(name)))
     modules = sorted({name.partition(":")[0] for name in names if isinstance(name, str)})
     for entry in (os.getcwd(), *sys.path) if modules else ():
         if Path(entry or ".").resolve().is_relative_to(inside):

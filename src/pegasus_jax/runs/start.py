@@ -92,7 +92,7 @@ def _config_of(config: Config | str | None, given: dict[str, Any]) -> Config:
 
     if isinstance(config, Config):
         config_io.check_used(config.task, given)
-        return config_io.override(config, config_io.values(given))
+        return config_io.override(config, config_io.values(config_io.without_random(given)))
     return preset(config or "cartpole", settings=given)
 
 
@@ -183,8 +183,11 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     config = resolve(asked.config)
     task = build(replace(config, seed=0), mesh).task
     resets = 1 if asked.config.start_mean else RESETS  # who says where episodes start has nobody reset a robot
+    from pegasus_jax.runs.begin import checked
+
     logs, notes = read_config(config, task)
-    for note in circles_found(asked.config, config) + before_training(config, task, resets) + notes:
+    notes = checked(config, task) + circles_found(asked.config, config) + before_training(config, task, resets) + notes
+    for note in notes:
         print(f"note: {note}", file=sys.stderr)
     return config, logs
 

@@ -302,13 +302,14 @@ def write_trials(run: Path, rows: list[dict[str, Any]]) -> None:
     write_whole(run / "trials.jsonl", lambda file: file.write(text.encode()))
 
 
-def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None = None) -> int:
+def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None = None, first: int = 1) -> int:
     """The trial after which the best policy was learned, judged by the rows of trials.jsonl, of which there is one.
 
     Where every policy was evaluated, that with the highest success rate, and of these with the lowest mean cost. Else
     by its own episodes on the plant: that of which most succeeded, and of these with the lowest mean cost;
     `last_episode` is one more than there are rows. What a fault or a person cut short does not count. A policy that
-    never ran is chosen only where none ran: the last one. Among equals it is the latest.
+    never ran is chosen only where none ran: the last one. Among equals it is the latest. With `first` 0 one that was
+    learned before the first episode is among them.
     """
     from pegasus_jax.episode import CUT
 
@@ -316,7 +317,8 @@ def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None =
         return max(rows, key=lambda row: (row["success_rate"], -row["mean_cost"], row["trial"]))["trial"]
     own: dict[int, list[tuple[float, float]]] = {}  # of each policy, (failed, cost) of its episodes
     for row in [*rows, *([last_episode] if last_episode else [])]:
-        if row["policy"] and row["episode_cost"] is not None and row["ended"] not in CUT:
+        learned = row["policy"] or (first == 0 and not row["random"])
+        if learned and row["episode_cost"] is not None and row["ended"] not in CUT:
             own.setdefault(row["policy"], []).append((1.0 - row["episode_success"], row["episode_cost"]))
     if not own:
         return rows[-1]["trial"]

@@ -11,7 +11,7 @@ import numpy as np
 from pegasus_jax import sharding
 from pegasus_jax.checks import SIZES, ConfigError
 from pegasus_jax.config import Config
-from pegasus_jax.runs import config_io, logged, writers
+from pegasus_jax.runs import begin, config_io, logged, writers
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.job import first_states, opened
 from pegasus_jax.runs.train import learn
@@ -45,7 +45,7 @@ def study(config: Config, seeds: list[int], path: Path | None = None) -> dict[st
     logs = logged.of_config(config)
     with opened(config, seeds, sharding.evenly(len(seeds)), logs) as job:
         job = job._replace(writer=one_json(config, seeds, job.experiment.task, keep))
-        learn(job, first_states(job))
+        learn(job, begin.begun(first_states(job), config))
     return result
 
 

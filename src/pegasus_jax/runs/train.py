@@ -17,13 +17,14 @@ from jax.sharding import Mesh
 
 from pegasus_jax import episode
 from pegasus_jax.checks import ConfigError, RunError
-from pegasus_jax.config import Config
+from pegasus_jax.config import Config, begins_with_policy, first_search
 from pegasus_jax.experiment import EVALUATE, trial_key
+from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.logs.read import Logged
-from pegasus_jax.runs import checkpoint, config_io, logged, restore, store, writers
+from pegasus_jax.runs import begin, checkpoint, config_io, logged, restore, store, writers
 from pegasus_jax.runs.collect import collected, stacked
-from pegasus_jax.runs.display import summary
-from pegasus_jax.runs.evaluation import evaluate, saturated
+from pegasus_jax.runs.display import learned, summary
+from pegasus_jax.runs.evaluation import UNMEASURED, evaluate, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
 from pegasus_jax.runs.programs import gather, is_main_process
 from pegasus_jax.runs.stuck import stuck
@@ -77,6 +78,8 @@ def train_seeds(
         for run in folders if is_main_process() else ():
             held.enter_context(store.lock(run, new=not resume))
             store.remove_unfinished(run)
+            if not resume:
+                begin.copy(config, run)
         before = config_io.load(folders[0] / "config.yaml") if resume else config
         if config.trials < before.trials:
             raise ConfigError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
@@ -93,22 +96,30 @@ def train_seeds(
                 f"{folders[0] / 'config.yaml'} has trials={config.trials}, and {most} are done; expected at least that"
             )
         states = first_states(job, stored, changed=(config.fit, config.search) != (before.fit, before.search))
+        if stored is None:
+            states = begin.begun(states, config, folders[0])
         multihost_utils.sync_global_devices("every process has read what there is")
         job = job._replace(writer=writers.run_folders(runs, config, task, command, say))
-        states = learn(job, states, 0 if stored is None else int(stored.trial[0]))
+        states = learn(job, states, None if stored is None else int(stored.trial[0]))
         if final:
             collected(job, states, config.trials + 1)
     return states
 
 
-def learn(job: Job, states: RunState, done: int = 0) -> RunState:
+def learn(job: Job, states: RunState, done: int | None = None) -> RunState:
     """Alg. 1: the states [S, ...] after the last trial of the config, `done` trials of which have been done before.
 
-    Raises RunError where the job's writer does not go on after a problem; an episode that was kept is never lost.
+    None: not even what comes before the first episode. Raises RunError where the job's writer does not go on after a
+    problem; an episode that was kept is never lost.
     """
-    job.writer.begin(done)
+    job.writer.begin(done or 0)
+    if done is None and first_search(job.config) == 0 and not job.logs.rows:
+        states, found = improved(job, states, 0)
+        job.display.line(f"before the first episode  {learned([UNMEASURED | row for row in found])}")
+    if done is None and (first_search(job.config) == 0 or begins_with_policy(job.config)):
+        job.writer.ready(states)
     before: list[Row] = []
-    for trial in range(done + 1, job.config.trials + 1):
+    for trial in range((done or 0) + 1, job.config.trials + 1):
         states, rows = one_trial(job, states, trial)
         job.writer.trial(trial, states, rows)
         for line in (summary(rows, job.config.trials), *stuck(before, rows)):
@@ -148,7 +159,7 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Ro
     episodes, policies = collected(job, states, trial)
     trajectories = stacked(episodes, task)
     # Before this episode teaches the model, and after another has. No first trial should wait for the compiler.
-    judged = trial > max(1, config.explore.trials)
+    judged = trial > first_search(config)
     calibration = gather(program("calibrate", states, trajectories)) if judged else np.full(len(episodes), np.nan)
     # Line 4: add the episode to the data.
     states, found = program("add_episode", states, trajectories), [UNKNOWN] * len(episodes)
@@ -181,13 +192,16 @@ def improved(
 ) -> tuple[RunState, list[Row]]:
     """Fit, search, and imagine what comes (lines 5 and 6 of Alg. 1); how it went, of each seed.
 
+    `trajectories` are the trial's own; None: it is 0, before the first episode, and a model without data is not fitted.
     Where no seed's model, or no seed's policy, could learn anything, the writer is told.
     """
     program, phase = job.program, job.display.phase
     phase(trial, "fit", 0.02)
-    incumbents = states.policy.params
-    states, fitted = program("fit", states)
-    fitted = gather(fitted)
+    incumbents, none = states.policy.params, np.zeros(len(job.seeds))
+    fitted = FitInfo(none, none, none)
+    if np.asarray(gather(states.data.size)).any():
+        states, fitted = program("fit", states)
+        fitted = gather(fitted)
     if not np.isfinite(fitted.loss).any():
         loss = float(fitted.loss[0])
         job.writer.problem(f"trial {trial}: the loss of the model's fit is {loss}, so nothing was learned")

@@ -28,6 +28,7 @@ class Writer(NamedTuple):
     """What is done with the results of S seeds. Every process of a job calls each function; one of them writes."""
 
     begin: Callable[[int], None]  # before the first trial of this job: so many trials are done already
+    ready: Callable[[RunState], None]  # the states [S, ...] before the first episode, where they have learned by then
     known: Callable[[int], list[Episode | None]]  # trial -> its episodes [S] that are kept already, None for others
     episode: Callable[[int, int, Episode, int], None]  # index of the seed, trial, episode, policy that ran (0: random)
     imagined: Callable[[int, Successor], None]  # trial, what its new policy is expected to do [S, ...]
@@ -41,6 +42,7 @@ def nothing(seeds: int) -> Writer:
     """Keeps nothing, says problems on standard error, and goes on: one seed's failure is not that of the others."""
     return Writer(
         begin=lambda done: None,
+        ready=lambda states: None,
         known=lambda trial: [None] * seeds,
         episode=lambda index, trial, ran, policy: None,
         imagined=lambda trial, successor: None,
@@ -66,6 +68,11 @@ def run_folders(runs: dict[int, Path], config: Config, task: Task, command: str,
             store.write_trials(run, store.readable_trials(run)[0][:done])
             boards.append(Board(run / "tensorboard", done + 1, say))
 
+    def ready(states: RunState) -> None:
+        whole = gather(states)
+        for index, run in enumerate(folders if is_main_process() else ()):
+            checkpoint.save(run, 0, part(whole, index))
+
     def episode(index: int, trial: int, ran: Episode, policy: int) -> None:
         if is_main_process() and len(ran.trajectory.u):
             store.save_episode(folders[index], trial, ran.trajectory, task, policy=policy, ended=ran.ended)
@@ -83,6 +90,7 @@ def run_folders(runs: dict[int, Path], config: Config, task: Task, command: str,
 
     return Writer(
         begin=begin,
+        ready=ready,
         known=lambda trial: [store.load_episode(run, trial) for run in folders],
         episode=episode,
         imagined=imagined,

@@ -1,9 +1,11 @@
 """Task names -> tasks. The only importer of pegasus_envs, and with it of MuJoCo and Gymnasium, once a task is made."""
 
 import dataclasses
+import inspect
+import math
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -12,11 +14,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pegasus_jax import interrupt, memory
-from pegasus_jax.checks import ConfigError, did_you_mean
+from pegasus_jax.checks import ConfigError, check_range, did_you_mean
 from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
 from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.math import circles
-from pegasus_jax.tasks import circled, sensed, terms, user_code
+from pegasus_jax.tasks import circled, priors, sensed, terms, user_code
 from pegasus_jax.tasks.signals import FILES, named, with_signals
 from pegasus_jax.tasks.starts import from_starts
 from pegasus_jax.tasks.terms import whole as whole
@@ -48,48 +50,66 @@ def of_plant(name: str, plant: "Plant") -> Task:
     )
 
 
-def _cartpole(_: Any) -> "Plant":
+def _cartpole(_: Any, arguments: Sequence[str]) -> "Plant":
     from pegasus_envs.cartpole import cartpole
 
-    return cartpole()
+    return cartpole(**_constants(arguments, cartpole))
 
 
-def _double_cartpole(_: Any) -> "Plant":
+def _double_cartpole(_: Any, arguments: Sequence[str]) -> "Plant":
     from pegasus_envs.double_cartpole import double_cartpole
 
-    return double_cartpole()
+    return double_cartpole(**_constants(arguments, double_cartpole))
 
 
-def _swimmer(maneuver: Any, legs: Any) -> "Plant":
+def _constants(arguments: Sequence[str], plant: Callable[..., "Plant"]) -> dict[str, float]:
+    """The physical constants of env_args.NAME=VALUE. Raises ConfigError for a name or a number that cannot be."""
+    found = {}
+    for name, _, value in (argument.partition("=") for argument in arguments):
+        if name not in (names := [*inspect.signature(plant).parameters]):
+            raise ConfigError(f"env_args.{name} is no constant of the plant; {did_you_mean(name, names)}")
+        try:
+            found[name] = float(value)
+        except ValueError:
+            raise ConfigError(f"env_args.{name}={value} is not a number; for example env_args.{name}=0.4") from None
+        check_range(f"env_args.{name}", found[name], 0, math.inf, open_high=True)
+    return found
+
+
+def _swimmer(maneuver: Any, legs: Any, _: Sequence[str]) -> "Plant":
     from pegasus_envs.swimmer.plant import swimmer
 
     return swimmer(maneuver, legs)
 
 
-# Name -> the plant, given how many of its legs a swimmer drives.
-TASKS: dict[str, Callable[[Any], "Plant"]] = {
+# Name -> the plant, given how many of its legs a swimmer drives, and constants of a cart-pole, as NAME=VALUE.
+TASKS: dict[str, Callable[[Any, Sequence[str]], "Plant"]] = {
     "cartpole": _cartpole,
     "double_cartpole": _double_cartpole,
     **{f"swimmer_{maneuver}": partial(_swimmer, maneuver) for maneuver in MANEUVERS},
 }
 
 
-def make(name: str, legs: int = 2) -> Task:
-    """The task of that name; only the swimmer has legs. Raises ConfigError for an unknown one."""
+def make(name: str, legs: int = 2, constants: Sequence[str] = ()) -> Task:
+    """The task of that name; only the swimmer has legs, and only a cart-pole constants such as pole_mass=0.4 [kg].
+
+    Raises ConfigError for an unknown one.
+    """
     if name not in TASKS:
         raise ConfigError(f"task={name} is unknown; {did_you_mean(name, TASKS)}")
-    return of_plant(name, TASKS[name](legs))
+    return of_plant(name, TASKS[name](legs, constants))
 
 
 def of_config(config: Config) -> Task:
     """The task that a config names."""
     own = {GYM: from_gym, MJCF: from_mjcf}
-    task = own[config.task](config) if config.task in own else make(config.task, config.legs)
+    task = own[config.task](config) if config.task in own else make(config.task, config.legs, config.env_args)
     if config.cost is not None and config.task not in own:
         task = task._replace(cost=Cost(user_code.load("cost", config.cost)))
     if config.starts and task.environment is None:
         task = from_starts(task, config.starts)
-    return sensed.sensed(with_signals(task, config), config.sensors)
+    task = sensed.sensed(with_signals(task, config), config.sensors)
+    return task if config.prior is None else task._replace(prior=priors.of_config(config, task))
 
 
 def rates_of(task: Task) -> tuple[int, ...]:
@@ -136,6 +156,8 @@ def resolve(config: Config) -> Config:
     """
     if isinstance(config.reference, str) and config.reference.endswith(FILES):
         config = dataclasses.replace(config, reference=os.path.abspath(config.reference))
+    if isinstance(config.prior, str) and config.prior.endswith(priors.FILE):
+        config = dataclasses.replace(config, prior=os.path.abspath(config.prior))
     if config.task == GYM:
         from pegasus_envs.gym_plant import EnvSpec, env_spec
 

@@ -1,0 +1,126 @@
+"""What a run takes over from another one, `init=RUN`: copied into its folder before anything else is in it.
+
+RUN/init/config.yaml, run.json, checkpoints/NNNN    of the other run, which may then be deleted
+"""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax.checks import ConfigError, RunError, shown
+from pegasus_jax.config import Config
+from pegasus_jax.experiment import Experiment
+from pegasus_jax.memory import seen_names
+from pegasus_jax.runs import checkpoint, config_io, restore, store
+from pegasus_jax.types import RunState, Task, TrainState
+
+FOLDER = "init"
+
+
+def source(init: str) -> tuple[Path, int]:
+    """The folder and the trial that init=RUN@TRIAL names, the best of init=RUN. Raises ConfigError, in one line."""
+    name, at, text = init.rpartition("@")
+    run, trial = Path(name if at else init), text if at else restore.BEST
+    if trial not in (restore.LAST, restore.BEST) and not trial.isdecimal():
+        raise ConfigError(f"init={init} names no trial: expected a number, best or last after @, as init=runs/sim@best")
+    try:
+        found = store.existing(run)
+        number = restore.best(found) if trial == restore.BEST else trial
+        return found, max(checkpoint.available(found), default=0) if number == restore.LAST else int(number)
+    except RunError as error:
+        raise ConfigError(f"init={init}: {error}") from error
+
+
+def read(run: Path, trial: restore.Trial, init: str) -> tuple[Config, Experiment, RunState]:
+    """`restore.restored`, whose errors name the setting: the run's task is that of its folder, nothing is imported."""
+    try:
+        return restore.restored(run, trial)
+    except RunError as error:
+        raise ConfigError(f"init={init}: {error}") from error
+
+
+def checked(config: Config, task: Task) -> list[str]:
+    """What to say of init=: one line each. Raises ConfigError, in one line that names both, where it does not suit."""
+    if config.init is None:
+        return []
+    run, trial = source(config.init)
+    old, other, _ = read(run, trial, config.init)
+    what, theirs = f"init={config.init}", other.task
+    for name, mine, its in (
+        ("states", len(task.state_names), len(theirs.state_names)),
+        ("controls", len(task.control_names), len(theirs.control_names)),
+    ):
+        if mine != its:
+            raise ConfigError(f"{what} is of {theirs.name} with {its} {name}, and {task.name} has {mine}")
+    if tuple(task.angles) != tuple(theirs.angles):
+        raise ConfigError(
+            f"{what} is of {theirs.name} with angles={shown(list(theirs.angles))}, and {task.name} has"
+            f" angles={shown(list(task.angles))}"
+        )
+    mine, its = (", ".join(seen_names(one)) for one in (task, theirs))
+    if len(seen_names(task)) != len(seen_names(theirs)):
+        raise ConfigError(f"{what} has a policy that sees {its}, and here it would see {mine}")
+    for part in config.init_parts:
+        its, mine = (config_io.leaves(getattr(one, part), f"{part}.") for one in (old, config))
+        for name in its:
+            if its[name] != mine.get(name):
+                hint = f"policy={its[name]}" if name == "policy.kind" else f"{name}={shown(its[name])}"
+                raise ConfigError(f"{what} has {name}={shown(its[name])}, and this run {shown(mine.get(name))}; {hint}")
+    if "model" in config.init_parts and (old.prior is None) != (config.prior is None):
+        raise ConfigError(
+            f"{what} has prior={shown(old.prior)}, and this run {shown(config.prior)}; init_parts=[policy]"
+        )
+    names = " and ".join(config.init_parts)
+    random = config.explore.trials
+    first = f"{random} random episodes come first" if random else "no episode is random"
+    notes = [f"{what}: begins with the {names} of trial {trial} of {theirs.name}; {first} (explore.trials={random})"]
+    for name in ("dt", "control_low", "control_high"):
+        mine, its = (np.asarray(getattr(one, name), float) for one in (task, theirs))
+        if not np.allclose(mine, its):
+            notes.append(f"{name} of {theirs.name} is {shown(its.tolist())}, here {shown(mine.tolist())}")
+    return notes
+
+
+def copy(config: Config, run: Path) -> None:
+    """Copy what the config's init= names into a new run's folder, which has no config.yaml yet."""
+    if config.init is None:
+        return
+    old, trial = source(config.init)
+    shutil.rmtree(run / FOLDER, ignore_errors=True)  # of a command that was killed before it began
+    (run / FOLDER / "checkpoints").mkdir(parents=True)
+    for name in ("config.yaml", "run.json", f"checkpoints/{trial:04d}.json"):
+        shutil.copyfile(old / name, run / FOLDER / name)
+    shutil.copytree(old / "checkpoints" / f"{trial:04d}", run / FOLDER / "checkpoints" / f"{trial:04d}")
+
+
+def begun(states: RunState, config: Config, run: Path | None = None) -> RunState:
+    """The first states [S, ...] of a config's runs, with what their init= gives; read from the copy in `run`, if any.
+
+    Raises RunError, or ConfigError, where it cannot be read.
+    """
+    if config.init is None:
+        return states
+    found = (run / FOLDER, restore.LAST) if run is not None else source(config.init)
+    return taken_over(states, read(*found, config.init)[2], config.init_parts)
+
+
+def taken_over(states: RunState, old: RunState, parts: tuple[str, ...]) -> RunState:
+    """States [S, ...] with the parameters of the parts of another state, of one run or [S, ...], in their precision.
+
+    Optimizers begin anew: their moments are those of another cost or of other data.
+    """
+
+    def part(name: str) -> TrainState:
+        mine: TrainState = getattr(states, name)
+        if name not in parts:
+            return mine
+        return mine._replace(params=jax.tree.map(like, getattr(old, name).params, mine.params))
+
+    def like(leaf: Any, mine: Any) -> Any:
+        return jnp.broadcast_to(jnp.asarray(leaf, mine.dtype), mine.shape)
+
+    return states._replace(policy=part("policy"), model=part("model"))

@@ -1,0 +1,286 @@
+"""From a simulator to the plant: prior= is the mean of a model, init= begins with another run."""
+
+import shutil
+from types import ModuleType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.robot import cartpole_by_hand
+from folders import TINY, a_run
+from pegasus_envs.cartpole import cartpole
+from pegasus_jax import compose, tasks
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.config import begins_with_policy, first_search
+from pegasus_jax.learn import data as dataset
+from pegasus_jax.models.ensemble import ensemble
+from pegasus_jax.models.residual import FURTHEST, differences, on_differences, residual
+from pegasus_jax.runs import begin, checkpoint, config_io, restore, store
+from pegasus_jax.runs.train import train
+from pegasus_jax.types import Batch, ModelLearner
+from pegasus_jax.vectorized import for_particles
+from probes import cart, experience, network, regression, same, tiny
+
+SMALL = {"fit.steps": "2", "eval_episodes": "0", "trials": "1"}
+
+
+def simulate(x, u):
+    """A made-up simulator of the rig's shapes: three states, the last an angle, and two controls."""
+    return jnp.stack([x[0] + 0.1 * x[1], 0.9 * x[1] + u[0], x[2] + 12.0 * u[1]])
+
+
+def parse(**words):
+    return config_io.parse(TINY | SMALL | {name.replace("__", "."): value for name, value in words.items()})
+
+
+# prior=
+
+
+@pytest.mark.parametrize("off", ["exact", "mixed"])
+def test_equations_by_hand_are_the_cart_poles(off):
+    c = cartpole_by_hand.constants(off)
+    plant = cartpole(pole_length=c["length"], pole_mass=c["pole"], cart_mass=c["cart"], friction=c["friction"])
+    x = jax.random.normal(jax.random.key(0), (20, 4)) * jnp.array([1, 2, 4, 2])
+    u = jax.random.uniform(jax.random.key(1), (20, 1), minval=-10, maxval=10)
+    theirs = jax.jit(jax.vmap(lambda x, u: plant.observe(plant.step(plant.state_from_observation(x), u))))(x, u)
+    np.testing.assert_allclose(jax.vmap(getattr(cartpole_by_hand, off))(x, u), theirs, atol=2e-3)
+
+
+def model(kind):
+    told = {"controls": 2 + 3}
+    return {
+        "bnn": lambda: network(**told),
+        "ensemble": lambda: ensemble(network(**told), 3),
+        "regression": lambda: regression(3, 5),
+    }[kind]()
+
+
+@pytest.mark.parametrize("kind", ["bnn", "ensemble"])
+def test_a_residual_is_the_simulator_and_what_was_learned_within_what_was_seen(kind):
+    """For one particle and for many, with an independent sum; its loss is that of the differences, which wrap."""
+    learned, data = model(kind), experience()
+    whole = residual(learned, simulate, angles=(2,))
+    params = whole.init(jax.random.key(0))
+    given = jax.jit(whole.posterior)(params, data)
+    x, u, keys = data.x[:7] * 1.1, data.u[:7], jax.random.split(jax.random.key(1), 7)
+    draws = jax.vmap(whole.sample, (0, None))(keys, given) if whole.deal is None else whole.deal(keys, given)
+    found = jax.jit(for_particles(whole.apply))(given, draws, x, u)
+    change = np.array(jax.vmap(simulate)(x, u)) - np.array(x)
+    change[:, 2] = np.angle(np.exp(1j * change[:, 2]))
+    added = for_particles(learned.apply)(given.learned, draws, x, np.concatenate([u, change], 1))
+    rows = np.array(jax.vmap(simulate)(data.x, data.u) - data.x)
+    left = np.array(data.y) - rows
+    left[:, 2] = np.angle(np.exp(1j * left[:, 2]))
+    limit = FURTHEST * np.abs(left[: int(data.size)]).max(0)
+    np.testing.assert_allclose(found.mean, change + limit * np.tanh(added.mean / limit), rtol=2e-4, atol=2e-5)
+    np.testing.assert_array_equal(found.std, added.std)
+    np.testing.assert_allclose(differences(data, simulate, (2,)).y, left, atol=1e-5)
+    assert np.abs(left[:, 2]).max() < np.pi + 1e-5 < np.abs(rows[:, 2]).max()
+    slope = jax.grad(lambda u: for_particles(whole.apply)(given, draws, x, u).mean[:, 2].sum())(u)
+    assert np.isfinite(slope).all()
+    assert np.all(slope[:, 1] != 0)
+    batch = Batch(data.x[:5], data.u[:5], data.y[:5])
+    raw = whole.loss(params, jax.random.key(2), batch, whole.prepare(data))
+    of_rows = learned.loss(params, jax.random.key(2), differences(batch, simulate, (2,)), whole.prepare(data))
+    assert float(raw) == float(of_rows)
+
+
+def test_before_there_are_data_a_residual_is_its_simulator():
+    whole = residual(model("bnn"), simulate, angles=(2,))
+    nothing = dataset.empty(8, 3, 2)
+    given = jax.jit(whole.posterior)(whole.init(jax.random.key(0)), nothing)
+    x, u = jnp.array([0.3, -0.2, 3.0]), jnp.array([0.5, 0.1])
+    predicted = whole.apply(given, whole.sample(jax.random.key(1), given), x, u)
+    np.testing.assert_allclose(predicted.mean, [-0.02, 0.52, 1.2], atol=1e-5)
+    assert np.isfinite(predicted.std).all()
+
+
+def test_what_fits_a_residual_is_given_the_differences():
+    seen = []
+    fitter = ModelLearner(lambda params: None, lambda key, learner, data, steps: (learner, seen.append(data)))
+    on_differences(fitter, simulate, (2,)).run(None, None, experience(), 3)
+    assert same(seen[0], differences(experience(), simulate, (2,)))
+    assert seen[0].u.shape == (40, 5)
+
+
+def test_a_policy_is_searched_in_the_simulator_before_the_first_episode():
+    """And later searches go on from it: nothing of what it learned is taken for that of a policy that knows nothing."""
+    plant = cart()
+    task = plant._replace(prior=plant.plant.step)
+    quick = dict(fit__steps=3, model__hidden=(4,), policy__hidden=(4,), search__particles=8)
+    exp = compose(tiny(trials=2, search__steps=30, explore__trials=0, **quick), task)
+    state = jax.jit(exp.init)(jax.random.key(0))
+    searched = jax.jit(exp.search)(state)[0]
+    imagine = jax.jit(exp.imagine)
+    assert imagine(searched)[1].mean() < imagine(state)[1].mean() - 0.02
+    collect = jax.jit(exp.collect)
+    assert collect(searched).cost.mean() < collect(state).cost.mean()
+
+
+def told(error):
+    text = str(error.value)
+    assert len(text.splitlines()) == 1
+    return text
+
+
+@pytest.mark.parametrize(
+    ("function", "part"),
+    [
+        (lambda x, u: x[:2], "returns (2,) of a state (4,) and a control (1,); expected the state"),
+        (lambda x, u: x / 0, "of the start [0.0, 0.0, 0.0, 0.0]; expected finite numbers"),
+        (lambda x, u: jnp.sqrt(jnp.abs(x)), "has a gradient that is not finite at the start"),
+        (lambda x: x, "TypeError"),
+    ],
+)
+def test_a_prior_that_is_none_is_one_line(function, part, monkeypatch):
+    module = ModuleType("theirs")
+    module.step = function
+    monkeypatch.setitem(__import__("sys").modules, "theirs", module)
+    with pytest.raises(ConfigError) as error:
+        tasks.of_config(parse(prior="theirs:step", model="log_normal"))
+    assert part in told(error)
+    assert told(error).startswith("prior=theirs:step")
+
+
+def test_a_prior_of_another_kind_of_model_or_size_is_one_line(tmp_path):
+    by_hand = "benchmarks.robot.cartpole_by_hand:low"
+    with pytest.raises(ConfigError, match=r"model=lagrangian is a mechanism.*the nearest is model=log_normal"):
+        compose(parse(prior=by_hand), tasks.of_config(parse(prior=by_hand)))
+    link = "<mujoco><worldbody><body><joint/><geom size='1'/></body></worldbody><actuator><motor joint='j'/></actuator>"
+    (tmp_path / "link.xml").write_text(f"{link}</mujoco>".replace("<joint/>", "<joint name='j' type='hinge'/>"))
+    with pytest.raises(ConfigError) as error:
+        tasks.of_config(parse(prior=str(tmp_path / "link.xml"), model="log_normal"))
+    assert "has the state j [rad], j' [rad/s], and cartpole has x [m]" in told(error)
+    with pytest.raises(ConfigError, match="there is no such file"):
+        tasks.of_config(parse(prior="nowhere.xml", model="log_normal"))
+
+
+@pytest.mark.slow
+def test_an_mjcf_prior_has_mujocos_slopes(tmp_path):
+    """With a joint's limit, which MJX computes in a loop that has no way back."""
+    file = tmp_path / "cart.xml"
+    file.write_text(
+        "<mujoco><option timestep='0.05' gravity='0 0 0'/><worldbody><body><joint name='s' type='slide' axis='1 0 0'"
+        " limited='true' range='-1 1'/><geom size='1' mass='2'/></body></worldbody><actuator><motor joint='s'"
+        " ctrlrange='-1 1'/></actuator></mujoco>"
+    )
+    words = dict(task="mjcf", mjcf=str(file), prior=str(file), dt="0.1", horizon="4", cost="tests.probes:cart")
+    task = tasks.of_config(config_io.parse(words))
+    x, u = jnp.array([0.1, 0.2]), jnp.array([0.5])
+    own = lambda x, u: task.plant.observe(task.plant.step(task.plant.state_from_observation(x), u))  # noqa: E731
+    np.testing.assert_allclose(task.prior(x, u), own(x, u), rtol=1e-6)
+    slopes = jax.jit(jax.jacrev(task.prior, (0, 1)))(x, u)
+    np.testing.assert_allclose(slopes[0], [[1, 0.1], [0, 1]], atol=1e-5)
+    np.testing.assert_allclose(slopes[1], [[0.5 * 0.05**2 * 3], [0.05]], atol=1e-5)
+
+
+# env_args
+
+
+def test_a_cart_pole_of_other_constants():
+    mine, theirs = tasks.of_config(parse(env_args__pole_mass="0.35")), cartpole(pole_mass=0.35)
+    assert mine.plant.model.body_mass.tolist() == theirs.model.body_mass.tolist()
+    with pytest.raises(ConfigError, match=r"env_args.pole_mas is no constant of the plant; did you mean 'pole_mass'"):
+        tasks.of_config(parse(env_args__pole_mas="0.35"))
+    with pytest.raises(ConfigError, match=r"env_args.pole_mass=light is not a number"):
+        tasks.of_config(parse(env_args__pole_mass="light"))
+
+
+# init=
+
+
+@pytest.fixture(scope="module")
+def simulator(tmp_path_factory):
+    """A run in the simulator, of three trials, of which the third is best."""
+    return a_run(tmp_path_factory.mktemp("runs") / "simulator", trials=3)
+
+
+def test_words_of_a_beginning_leave_out_random_episodes(simulator):
+    assert parse().explore.trials == 1
+    assert (first_search(parse()), begins_with_policy(parse())) == (1, False)
+    config = parse(init=str(simulator))
+    assert (config.explore.trials, first_search(config), begins_with_policy(config)) == (0, 1, True)
+    assert parse(init=str(simulator), explore__trials="2").explore.trials == 2
+    only = parse(init=str(simulator), init_parts="[model]")
+    assert (only.explore.trials, begins_with_policy(only)) == (1, False)
+    simulated = parse(prior="benchmarks.robot.cartpole_by_hand:low")
+    assert (simulated.explore.trials, first_search(simulated)) == (0, 0)
+
+
+def test_what_a_run_begins_with_is_said_and_copied(simulator, tmp_path):
+    config = parse(init=f"{simulator}@2", trials="3")
+    task = tasks.of_config(config)
+    (note,) = begin.checked(config, task)
+    assert "begins with the policy of trial 2 of cartpole; no episode is random (explore.trials=0)" in note
+    (tmp_path / "new").mkdir()
+    begin.copy(config, tmp_path / "new")
+    begin.copy(config, tmp_path / "new")  # of a command that was killed before it began
+    old = restore.restored(simulator, 2)[2]
+    fresh = jax.tree.map(lambda leaf: leaf[None], jax.jit(compose(config, task).init)(jax.random.key(5)))
+    for run in (tmp_path / "new", None):
+        states = begin.begun(fresh, config, run)
+        assert same(states.policy.params, jax.tree.map(lambda leaf: leaf[None], old.policy.params))
+        assert same(
+            (states.model, states.data, states.policy.optimizer), (fresh.model, fresh.data, fresh.policy.optimizer)
+        )
+    both = begin.taken_over(fresh, old, ("policy", "model"))
+    assert same(both.model.params, jax.tree.map(lambda leaf: leaf[None], old.model.params))
+    assert begin.source(str(simulator)) == (simulator, restore.best(simulator))
+
+
+def said(words):
+    config = config_io.parse(words)
+    return begin.checked(config, tasks.of_config(config))
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (dict(init="better"), "init=better is no run; search.init=better is what a search starts from"),
+        (dict(init="nowhere"), "init=nowhere: nowhere is not a run"),
+        (dict(init="RUN@first"), "names no trial: expected a number, best or last after @"),
+        (dict(init="RUN@9"), "has no checkpoint of trial=9; choose from 1, 2, 3"),
+        (dict(init="RUN", init_parts="[data]"), "init_parts=data is not a choice; choices: policy, model"),
+        (dict(init="RUN", policy__hidden="[4]"), "has policy.hidden=[3], and this run [4]; policy.hidden=[3]"),
+        (dict(init="RUN", policy="rbf"), "has policy.kind=mlp, and this run rbf; policy=mlp"),
+        (dict(init="RUN", init_parts="[model]", model="log_normal"), "has model.kind=lagrangian, and this run bnn"),
+        (dict(init="RUN", task="double_cartpole"), "is of cartpole with 4 states, and double_cartpole has 6"),
+    ],
+)
+def test_a_beginning_that_does_not_suit_is_one_line(words, part, simulator):
+    words = words | {"init": words["init"].replace("RUN", str(simulator))}
+    given = {name: value for name, value in TINY.items() if name not in ("policy.hidden",) or "policy" not in words}
+    words = given | SMALL | {name.replace("__", "."): value for name, value in words.items()}
+    with pytest.raises(ConfigError) as error:
+        said(words)
+    assert part in told(error)
+
+
+def test_angles_and_periods_of_another_task_are_told(simulator):
+    config = parse(init=str(simulator))
+    task = tasks.of_config(config)
+    with pytest.raises(ConfigError, match=r"of cartpole with angles=\[3\], and cartpole has angles=\[\]"):
+        begin.checked(config, task._replace(angles=()))
+    notes = begin.checked(config, task._replace(dt=0.2, control_high=task.control_high / 2))
+    assert any("dt of cartpole is 0.1, here 0.2" in note for note in notes)
+    assert any("control_high of cartpole is [10], here [5]" in note or "[10.0], here [5.0]" in note for note in notes)
+
+
+@pytest.mark.slow
+def test_a_run_that_began_with_another_goes_on_without_it(simulator, tmp_path):
+    """Its first episode is by the old policy, which is trial 0 of it; killed after that, it ends as in one piece."""
+    old = shutil.copytree(simulator, tmp_path / "old")
+    config = parse(init=str(old), preset="cartpole_network", trials="1")
+    whole = train(config, tmp_path / "whole")
+    row = store.trials(tmp_path / "whole")[0]
+    assert (row["random"], row["policy"]) == (False, 0)
+    assert restore.best(tmp_path / "whole") in (0, 1)
+    first = restore.restored(tmp_path / "whole", 0)[2]
+    assert same(first.policy.params, restore.restored(simulator, "best")[2].policy.params)
+    cut = shutil.copytree(tmp_path / "whole", tmp_path / "cut")
+    shutil.rmtree(cut / "checkpoints")
+    (cut / "trials.jsonl").unlink()
+    shutil.rmtree(old)
+    assert checkpoint.fingerprint(train(config, cut, resume=True)) == checkpoint.fingerprint(whole)
