@@ -211,7 +211,7 @@ def experiment(
         u = trajectory.u if m is None else jax.vmap(given)(m[:-1], trajectory.u)
         if task.hindsight is None:
             return trajectory._replace(u=u), m
-        length = len(u) if trajectory.length is None else trajectory.length
+        length = jnp.int32(len(u)) if trajectory.length is None else trajectory.length
         x, more = task.hindsight.states(trajectory.x, length, u)
         return trajectory._replace(x=x, u=jnp.concatenate([u, more], 1)), m
 

@@ -160,7 +160,7 @@ def replay(memory: Memory, trajectory: Trajectory) -> Array | None:
         return None
     o, u = jnp.asarray(trajectory.x), jnp.asarray(trajectory.u)
     # An episode from elsewhere does not tell what was drawn for it.
-    first = begin(memory, jax.random.key(0), o[0]) if trajectory.memory is None else jnp.asarray(trajectory.memory)
+    first: Any = begin(memory, jax.random.key(0), o[0]) if trajectory.memory is None else jnp.asarray(trajectory.memory)
 
     def step(m: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
         m = memory.advance(m, *row)

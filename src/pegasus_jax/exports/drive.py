@@ -105,8 +105,9 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
 
     def save(ran: Episode) -> Drive:
         ran = ran._replace(trajectory=ran.trajectory._replace(memory=memories[0] if memories else None))
-        seen = states(task, ran.trajectory)[1:] if len(ran.trajectory.u) else []
-        cost = np.asarray(jax.vmap(task.cost.of_state)(seen) if len(seen) else [], np.float32)
+        drove = len(ran.trajectory.u) > 0
+        cost = jax.vmap(task.cost.of_state)(states(task, ran.trajectory)[1:]) if drove else []
+        cost = np.asarray(cost, np.float32)
         kept = ran._replace(trajectory=ran.trajectory._replace(cost=cost))  # type: ignore[arg-type]
         done = Drive(log, kept, task.dt, np.array(times[: len(ran.trajectory.u)]) - (times[0] if times else 0))
         if len(done.times):

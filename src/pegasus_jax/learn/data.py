@@ -11,8 +11,8 @@ __all__ = ["add", "empty", "grow", "minibatch"]
 
 def empty(capacity: int, states: int, controls: int, memory: int = 0) -> Dataset:
     """A data set of `capacity` rows, none in use."""
-    rows = [jnp.zeros((capacity, size)) for size in (states, controls, states)]
-    return Dataset(*rows, jnp.int32(0), jnp.zeros((capacity, memory)) if memory else None)
+    x, u, y = (jnp.zeros((capacity, size)) for size in (states, controls, states))
+    return Dataset(x, u, y, jnp.int32(0), jnp.zeros((capacity, memory)) if memory else None)
 
 
 def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...], memory: Array | None = None) -> Dataset:

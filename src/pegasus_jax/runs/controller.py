@@ -57,7 +57,7 @@ class Controller:
             self._given = given = np.zeros(given.shape, self._type)
             if task.reference is not None:
                 at = times(task)
-                values = np.asarray(jax.vmap(task.reference.value)(at))
+                values = np.asarray(jax.vmap(task.reference.value)(jnp.asarray(at)))
                 self.reference = lambda t: [np.interp(t, at, column) for column in values.T]
         self._goal: np.ndarray | None = None
         self.reset()
