@@ -198,7 +198,7 @@ def improved(
     program, phase = job.program, job.display.phase
     phase(trial, "fit", 0.02)
     incumbents, none = states.policy.params, np.zeros(len(job.seeds))
-    fitted: Any = FitInfo(*(none,) * len(FitInfo._fields))
+    fitted = FitInfo(*(none,) * len(FitInfo._fields))  # type: ignore[arg-type]
     if np.asarray(gather(states.data.size)).any():
         states, fitted = program("fit", states)
         fitted = gather(fitted)
