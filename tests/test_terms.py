@@ -336,7 +336,7 @@ def hold(x, u, previous_u, goal):
 def test_a_robot_with_goals_from_the_first_episode_to_the_file_that_drives_it(tmp_path):
     """What is stored can be counted again by hand, and the file is the controller that was asked for the goal."""
     small = SMALL | {"eval_episodes": "0", "horizon": "6", "env": "Pendulum-v1", "circles": "[[0,1]]"}
-    small |= {"goal_low": "[-0.3]", "goal_high": "[0.3]"}
+    small |= {"goal_low": "[-0.3]", "goal_high": "[0.3]", "search.visited_starts": "0"}
     run = train("gym", out=tmp_path / "run", settings=small, cost=hold)
     drawn = []
     for trial in (1, 2):
