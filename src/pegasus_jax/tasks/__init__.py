@@ -16,7 +16,7 @@ from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
 from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.math import circles
-from pegasus_jax.tasks import circled, sensed, terms, user_code
+from pegasus_jax.tasks import circled, constrained, guide, sensed, terms, user_code
 from pegasus_jax.tasks.signals import FILES, named, with_signals
 from pegasus_jax.tasks.starts import from_starts
 from pegasus_jax.tasks.terms import whole
@@ -89,7 +89,8 @@ def of_config(config: Config) -> Task:
         task = task._replace(cost=Cost(user_code.load("cost", config.cost)))
     if config.starts and task.environment is None:
         task = from_starts(task, config.starts)
-    return sensed.sensed(with_signals(task, config), config.sensors)
+    task = sensed.sensed(with_signals(task, config), config.sensors)
+    return task._replace(constraint=constrained.of_config(config, task), guide=guide.of_config(config, task))
 
 
 def rates_of(task: Task) -> tuple[int, ...]:
@@ -197,6 +198,8 @@ def _complete(config: Config) -> None:
     if config.env is None or config.cost is None:
         raise ConfigError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
     terms.agree(user_code.load("cost", config.cost), *named(config))
+    if config.constraint is not None:
+        user_code.load("constraint", config.constraint)
     module, colon, _ = config.env.partition(":")
     if colon:  # Gymnasium imports it, to register what is in it
         user_code.importing(f"env={config.env}", module)
