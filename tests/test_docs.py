@@ -207,7 +207,7 @@ def test_every_block_is_a_program_a_file_or_commands() -> None:
                 assert block.file, f"{page.name} does not say what the file is called: {block.text[:40]}"
             for command in commands(block) if block.kind in ("", "bash", "sh") else ():
                 assert shlex.split(command)[0].startswith(("pegasus-", "make", "python", "cc")), command
-    of_plants = {"mymodule.py", "arm.xml", "robot.py", "drive.py", "encoder.py", "simulator.py"}
+    of_plants = {"mymodule.py", "arm.xml", "robot.py", "drive.py", "encoder.py", "simulator.py", "trolley.py"}
     assert {block.file for block in FILES} == of_plants | {
         "lean.py",
         "on_robot.py",

@@ -256,11 +256,21 @@ class Explore:
 
     trials: int = setting(1, "episodes of random controls")
     kind: str = setting("uniform", "uniform: a fresh control each step; walk: a random walk")
+    amplitude: float | None = setting(
+        None, "part of the control range that these grow to over an episode; null: all of it at once", EVERY
+    )
+    policy: str | Callable | None = setting(  # noqa: RUF009 (frozen)
+        None,
+        "module:function, observation -> controls, or a run's folder; with amplitude= random ones are added",
+        EVERY,
+    )
 
     def __post_init__(self) -> None:
         checks.typed("explore", self)
         checks.size("explore.trials", self.trials, 0)
         checks.choice("explore.kind", self.kind, EXPLORATIONS)
+        if self.amplitude is not None:
+            checks.check_range("explore.amplitude", self.amplitude, 0, 1, open_low=True)
 
 
 @dataclass(frozen=True)
@@ -347,6 +357,10 @@ class Config:
         None, "module:function, observation [D] -> probability that an episode ends there, in JAX", OWN
     )
     stop_cost: float = setting(1.0, "of each control period that an early end leaves out", OWN)
+    constraint: str | Callable | None = setting(  # noqa: RUF009 (frozen)
+        None, "module:function, observation [D] -> numbers, each at most 0 where a policy may be, in JAX", EVERY
+    )
+    constraint_bound: float = setting(0.05, "most probable share of the episodes that break the constraint", EVERY)
     observe: tuple[str, ...] = setting((), "as [qpos.0,qvel.1]; []: all positions, then all velocities", (MJCF,))
     control_low: tuple[float, ...] = setting((), "least controls; []: the action space's, the file's ctrlrange", OWN)
     control_high: tuple[float, ...] = setting(
@@ -386,6 +400,7 @@ class Config:
         checks.choice("legs", self.legs, LEGS)
         checks.choice("successor", self.successor, SUCCESSORS)
         checks.check_range("stop_cost", self.stop_cost, 0)
+        checks.check_range("constraint_bound", self.constraint_bound, 0, 1, open_low=True, open_high=True)
         for name in ("env_args", "angles", "rates", "observe"):
             checks.different(name, getattr(self, name))
         for name in ("control_low", "control_high", "start_mean", "goal_low", "goal_high"):

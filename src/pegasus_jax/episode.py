@@ -169,6 +169,15 @@ def uniform(key: Key, low: Array, high: Array, horizon: int) -> Array:
     return jax.random.uniform(key, (horizon, low.shape[0]), minval=low, maxval=high)
 
 
+def gently(plan: Array, amplitude: float, low: Array, high: Array) -> Array:
+    """Controls [H, U] drawn in towards rest, 0 or the limit next to it: `amplitude` of how far they were from it.
+
+    That is so in the last period; in the first it is a fifth of that, and grows evenly, so that a person can step in.
+    """
+    rest = jnp.clip(0.0, low, high)
+    return rest + amplitude * jnp.linspace(0.2, 1.0, len(plan))[:, None] * (plan - rest)
+
+
 def random_walk(key: Key, low: Array, high: Array, horizon: int, move: float = 0.3, pull: float = 0.75) -> Array:
     """Random controls [H, U]: with probability `move` a step goes `pull` of the way to a fresh uniform draw.
 

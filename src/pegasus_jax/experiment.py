@@ -13,6 +13,7 @@ from jax.core import Tracer
 from pegasus_jax import episode
 from pegasus_jax import memory as recall
 from pegasus_jax.episode import Episode
+from pegasus_jax.imagine import limits
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
@@ -45,6 +46,7 @@ class Successor(NamedTuple):
     cost: Array  # [H, K] of that rollout
     incumbent: Array  # [] expected cost a step of the policy before the search; NaN where it was not asked for
     replaced: Array  # [] whether the search's policy took its place
+    chance: Array | None = None  # [] that an episode breaks the task's constraint, as expected; None: there is none
 
 
 class Experiment(NamedTuple):
@@ -131,13 +133,19 @@ def experiment(
     def act(params: Params, key: Key, x: Array) -> Array:
         return policy.apply(params, policy.sample(key), x)
 
+    def guided(x: Any, added: Any, numpy: Any) -> Any:
+        """The controls [U] of the task's first controller, and what is added to them, within the limits."""
+        u = numpy.asarray(task.guide(x), added.dtype) + added  # type: ignore[misc]
+        return numpy.clip(u, numpy.asarray(task.control_low), numpy.asarray(task.control_high)).astype(added.dtype)
+
     def one_episode(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
         """An episode of the policy, or of random controls. One function, because a plant is slow to compile."""
         plan_key, run_key = jax.random.split(key)
         plan = explore(plan_key)
 
         def control(key: Key, t: Array, x: Array) -> Array:
-            return jnp.where(exploring, plan[t], act(policy_params, key, x))
+            first = plan[t] if task.guide is None else guided(x[:states], plan[t], jnp)
+            return jnp.where(exploring, first, act(policy_params, key, x))
 
         return episode.run(run_key, control, task)
 
@@ -170,7 +178,7 @@ def experiment(
             if t == 0:
                 first = m = begin(seed_key, x)
             if exploring:
-                return plan[t]
+                return plan[t] if task.guide is None else guided(x, plan[t], np)
             u, m = react(policy_params, jax.tree.map(lambda z: z[t], noise), m, x)
             return np.asarray(u)
 
@@ -254,32 +262,40 @@ def experiment(
         )
         return state._replace(policy=learner), info
 
+    def chance_of(rolled: Rollout) -> Any:
+        return None if task.constraint is None else limits.probability(rolled.x, task.constraint)
+
     def succeed(state: RunState, incumbent: Params) -> tuple[RunState, Successor]:
         """The policy that goes on after a search: its own, or an incumbent that works and is expected to cost no more.
 
-        Both are imagined on the same fresh scenarios under the new model. One that failed teaches nothing new.
+        Both are imagined on the same fresh scenarios under the new model. One that failed teaches nothing new. One that
+        is expected to break the task's constraint more often than its bound wins over none that is not.
         """
         posterior = posterior_of(state)
         key = trial_key(state.key, state.trial, IMAGINE)
         rolled, cost = imagine(key, state.policy.params, posterior)
+        chance = chance_of(rolled)
         if not compare:
             return state._replace(policy_trial=state.trial), Successor(
-                rolled, cost, jnp.full((), jnp.nan), jnp.bool_(True)
+                rolled, cost, jnp.full((), jnp.nan), jnp.bool_(True), chance
             )
         old_rolled, old_cost = imagine(key, incumbent, posterior)
-        old, new = jnp.mean(old_cost), jnp.mean(cost)
+        old, new, old_chance = jnp.mean(old_cost), jnp.mean(cost), chance_of(old_rolled)
         if expect is not None:
             old, new = (expect(key, params, posterior) for params in (incumbent, state.policy.params))
         unlearned = jnp.bool_(False) if begun else state.policy_trial == 0 if first_search else state.trial == 0
-        replaced = unlearned | ~state.succeeded | ~(old <= new)
-        rolled, cost, params = optax.tree.where(
-            replaced, (rolled, cost, state.policy.params), (old_rolled, old_cost, incumbent)
+        better = ~state.succeeded | ~(old <= new)
+        if task.constraint is not None:
+            better = limits.prefers(better, chance, old_chance, bound=task.constraint.bound)
+        replaced = unlearned | better
+        rolled, cost, params, chance = optax.tree.where(
+            replaced, (rolled, cost, state.policy.params, chance), (old_rolled, old_cost, incumbent, old_chance)
         )
         state = state._replace(
             policy=state.policy._replace(params=params),
             policy_trial=jnp.where(replaced, state.trial, state.policy_trial),
         )
-        return state, Successor(rolled, cost, old, replaced)
+        return state, Successor(rolled, cost, old, replaced, chance)
 
     def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
         """Fit and search (Alg. 1 lines 5 and 6), unless the next episode is random too: then nothing, and NaN of it."""

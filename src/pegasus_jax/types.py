@@ -173,8 +173,7 @@ class Task(NamedTuple):
     """What is to be learned: a plant's interface, a cost, and where episodes start."""
 
     name: str
-    # reset(key) -> state; step(state, u [U]) -> state; observe(state) -> x [D]. None: others supply the episodes
-    plant: Any
+    plant: Any  # reset(key) -> state; step(state, u [U]) -> state; observe(state) -> x [D]. None: others give episodes
     cost: Cost
     angles: tuple[int, ...]  # the dimensions of x that are angles [rad]
     start_mean: Any  # [D]
@@ -207,6 +206,8 @@ class Task(NamedTuple):
     terms: tuple[str, ...] | None = None
     reference: Signal | None = None
     goal: Signal | None = None
+    constraint: Any = None  # an `imagine.limits.Constraint`; None: a policy may do anything
+    guide: Callable[[Any], Any] | None = None  # x [D] -> u [U], the controller of the first episodes; None: random
 
     @property
     def may_end(self) -> bool:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import lru_cache, partial
 
 import jax
+import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from pegasus_jax import config as settings
@@ -16,7 +17,7 @@ from pegasus_jax.imagine import visited
 from pegasus_jax.models.residual import on_differences, residual
 from pegasus_jax.sharding import over_particles
 from pegasus_jax.tasks.remembered import remembering
-from pegasus_jax.types import Array, Cost, Dynamics, ModelLearner, Policy, PolicyOptimizer, Task
+from pegasus_jax.types import Array, Cost, Dynamics, Key, ModelLearner, Policy, PolicyOptimizer, Task
 
 EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 
@@ -58,8 +59,6 @@ def compose(
     policy = policy or policy_of(config.policy, task)
     policy = policy._replace(memory=task.memory) if task.memory.names else policy
     searching = search_of(config.search, task, dynamics, policy, over_particles(mesh))
-    low, high = limits(task)
-    explore = config.explore
     return experiment(
         task=task,
         dynamics=dynamics,
@@ -71,13 +70,23 @@ def compose(
         imagine=searching.imagine,
         expect=searching.expect if visits else None,
         remember=visited.remember if visits else None,
-        explore=partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon),
-        explore_trials=explore.trials,
-        first_search=settings.first_search(config) if task.prior is None else explore.trials,
+        explore=explore_of(config.explore, task),
+        explore_trials=config.explore.trials,
+        first_search=settings.first_search(config) if task.prior is None else config.explore.trials,
         begun=settings.begins_with_policy(config),
         compare=config.successor == "better",
         capacity=config.trials * task.horizon + logged,
     )
+
+
+def explore_of(explore: settings.Explore, task: Task) -> Callable[[Key], Array]:
+    """The controls [H, U] of an exploring episode of a key; beside a task's `guide` those that are added to its own."""
+    low, high = limits(task)
+    plan = partial(EXPLORATIONS[explore.kind], low=low, high=high, horizon=task.horizon)
+    amplitude = explore.amplitude
+    if task.guide is not None:
+        return lambda key: episode.gently(plan(key), amplitude or 0.0, low, high) - jnp.clip(0.0, low, high)
+    return plan if amplitude is None else lambda key: episode.gently(plan(key), amplitude, low, high)
 
 
 def as_cost(cost: Cost | Callable[[Array], Array]) -> Cost:

@@ -28,6 +28,8 @@ from pegasus_jax.policies.mlp import mlp
 from pegasus_jax.policies.squash import SQUASHES, to_limits
 from pegasus_jax.types import Dropout, Dynamics, ModelLearner, Policy, Task
 
+AT_REST = 0.05  # of the outgoing weights of a network controller, where there is a constraint
+
 NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
     "log_normal": lambda config: dropout.log_normal(config.log_z_min),
     "binary": lambda _: dropout.binary(),
@@ -128,4 +130,6 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
                 dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
                 initializer=config.initializer,
                 input_scale=tasks.input_scale(task, config.input_units),
+                # Within a constraint a policy grows from one that hardly moves, and need not find its way back.
+                output_scale=1.0 if task.constraint is None else AT_REST,
             )

@@ -11,6 +11,7 @@ from pegasus_jax import config as settings
 from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs as cost
+from pegasus_jax.imagine import limits as limited
 from pegasus_jax.imagine import matching, scenarios
 from pegasus_jax.imagine.objective import either, objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
@@ -99,19 +100,25 @@ def search_of(
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
     # A particle's cost is 1 / K of the objective.
     limit = None if (most := search.particle_grad_limit) is None else most / search.particles
+    objective_of, ascend = objective, None
+    if (constraint := task.constraint) is not None:
+        objective_of = partial(limited.constrained, constraint=constraint)
+        ascend = partial(limited.ascend, bound=constraint.bound)
+        pieces["dynamics"] = limited.held(dynamics, limited.over(constraint, task.stop))
     match = matching_of(search, task).particles(task.angles)
     costs = costs_of(search, task)
     table = table_of(search)
     # What no row asks for is not compiled.
     refines, widens = table.refine.any(), (table.cost_width != 1).any()
 
-    def value(params: Params, posterior: Params, given: Scenarios, row: SearchTable) -> Array:
+    def value(params: Params, posterior: Params, given: Scenarios, row: SearchTable, *weight: Array) -> Any:
         refining = row.refine if refines else None
         given = started(given, row.refine) if search.visited_starts else given
-        return objective(
+        return objective_of(
             params,
             posterior,
             given,
+            *weight,
             **pieces,
             limit=None if limit is None else limit * row.limit,
             match=either(refining, matching.keep, match),  # what refines has no matching, and each particle's own cost
@@ -121,7 +128,7 @@ def search_of(
     clip = optax.identity() if search.grad_clip is None else optax.clip_by_global_norm(search.grad_clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
     draws = scenarios.sampler(searched, Period(**vars(search.period)))
-    found = searcher(Problem(value, draws, optimizer, table, search.reset_optimizer))
+    found = searcher(Problem(value, draws, optimizer, table, search.reset_optimizer, ascend))
     if search.num_starts > 1:
         lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
         # What refines may end with another than its last.
@@ -138,8 +145,8 @@ def search_of(
 
 
 def matching_of(search: settings.Search, task: Task) -> Matching:
-    """What search.matching names, where what the task remembers can be matched."""
-    return MATCHINGS[search.matching] if task.memory.matched else UNMATCHED
+    """What search.matching names, where the task's memory can be matched, and no constraint asks for trajectories."""
+    return MATCHINGS[search.matching] if task.memory.matched and task.constraint is None else UNMATCHED
 
 
 def table_of(search: settings.Search) -> SearchTable:
@@ -171,6 +178,8 @@ def analytic_search_of(
             "algorithm=pilco propagates a Gaussian of the state alone; what is remembered beside it"
             f" ({', '.join(task.memory.names[:3])}, ...) needs another algorithm="
         )
+    if task.constraint is not None:
+        raise ConfigError("algorithm=pilco propagates a Gaussian, which has no trajectories; leave out constraint=")
     if dynamics.moments is None:
         raise ConfigError("algorithm=pilco needs a model with analytic moments: model=ssgp, model=gp")
     if policy.moments is None:

@@ -10,8 +10,8 @@ import optax
 
 from pegasus_jax.imagine.scenarios import Sampler
 from pegasus_jax.learn.gradient import SearchInfo
-from pegasus_jax.learn.schedule import FRESH, START, STEP, SearchTable, first_rows
-from pegasus_jax.learn.updates import is_finite, update_if
+from pegasus_jax.learn.schedule import FRESH, STEP, SearchTable, first_rows
+from pegasus_jax.learn.visits import Ascend, after, begun, valued
 from pegasus_jax.types import Array, Key, Params, PolicyOptimizer, TrainState
 
 
@@ -22,6 +22,7 @@ class SearchState(NamedTuple):
     start: Params  # what the search, or its refinement, started from
     last: Array  # [] the objective at the row before
     no_improvement: Array  # [] whether the last search found nothing better than what it was given, before it refined
+    multiplier: Any = None  # [] of a constraint's penalty, kept from search to search; None: there is no constraint
 
 
 class Problem(NamedTuple):
@@ -32,13 +33,17 @@ class Problem(NamedTuple):
     optimizer: optax.GradientTransformation  # any of optax
     table: SearchTable
     reset_optimizer: bool = True  # whether each search starts with a new optimizer state
+    # What a constraint makes of its multiplier; None: there is none. With it the objective's last argument is the
+    # multiplier, and it returns (value, probability).
+    ascend: Ascend = None
 
 
 def searcher(problem: Problem) -> PolicyOptimizer:
     """The searcher of a problem: its `run` is `search`, its learner's optimizer a `SearchState`."""
 
     def init(params: Params) -> SearchState:
-        return SearchState(problem.optimizer.init(params), params, jnp.asarray(jnp.inf, float), jnp.zeros((), bool))
+        none = jnp.asarray(jnp.inf, float), jnp.zeros((), bool), begun(problem.ascend)
+        return SearchState(problem.optimizer.init(params), params, *none)
 
     return PolicyOptimizer(init, partial(search, problem=problem))
 
@@ -75,8 +80,8 @@ def search(
         now: SearchTable = jax.tree.map(lambda column: column[row + k], rows)
         (own, state), choose = learner, partial(jax.lax.select_n, now.candidate)
         visited = jax.tree.map(choose, own, fresh if asks else own, state.start, state.start)
-        value, gradient = jax.value_and_grad(problem.objective)(visited, posterior, scenarios, now)
-        learner, cost, skipped = after(now, learner, visited, value, gradient, problem)
+        value, gradient, weight = valued(problem, state.multiplier, visited, posterior, scenarios, now)
+        learner, cost, skipped = after(now, learner, visited, value, gradient, weight, problem)
         i = now.iteration - first
         stepped = jnp.where(now.action == STEP, i, steps)
         norms = info.gradient_norm.at[stepped].set(optax.tree.norm(gradient), mode="drop")
@@ -97,20 +102,3 @@ def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
     # Where all are alike there is no choice to make: of searches vmapped over `earlier` each would have its own.
     number = jnp.minimum(earlier, most) if (most := len(table.limit) - 1) else 0
     return SearchTable(*map(jnp.asarray, table[:-3]), *(jnp.asarray(column)[number] for column in table[-3:]))
-
-
-def after(
-    row: SearchTable, learner: TrainState, visited: Params, value: Array, gradient: Params, problem: Problem
-) -> tuple[TrainState, Array, Array]:
-    """What a row makes of the cost and gradient of what it visited -> (learner, cost of its parameters, skipped)."""
-    (params, state), finite, steps_now = learner, is_finite(gradient), row.action == STEP
-    # NaN decides for the older policy, a tie for the other one: where the cost is flat, nothing else leads away.
-    older = ~(state.last < value)
-    taken = jnp.stack([True, (value <= state.last) | state.no_improvement, older, older])[row.candidate] | steps_now
-    params = optax.tree.where(taken, visited, params)
-    now = TrainState(params, state.optimizer)
-    updates, moved = update_if(steps_now & finite, problem.optimizer, gradient, now, value=value)
-    start = optax.tree.where(row.candidate >= START, params, state.start)
-    found = SearchState(moved, start, value, jnp.where(row.candidate == START, taken, state.no_improvement))
-    params = optax.apply_updates(params, optax.tree.scale(row.step_size, updates))
-    return TrainState(params, found), jnp.where(taken, value, state.last), steps_now & ~finite

@@ -21,16 +21,21 @@ def mlp(
     saturate: Callable[[Array], Array],
     initializer: str,
     input_scale: Array | float = 1.0,
+    output_scale: float = 1.0,
 ) -> Policy:
     """u = saturate(network(encode(x) * input_scale)); noise is on each hidden layer's output (docs/reference.md 5.1).
 
-    What the data have large is standardized on its way in, see `scaled`.
+    What the data have large is standardized on its way in, see `scaled`. The outgoing weights begin `output_scale`
+    times as large as usual: a small one begins with controls near the middle of their range.
     """
     network = MLP(hidden, controls, initializer)
 
     def init(key: Key) -> Params:
         net_key, *keys = jax.random.split(key, 1 + len(hidden))
         net: Any = network.init(net_key, jnp.zeros(features), [None] * (len(hidden) + 1))
+        if output_scale != 1:
+            last = f"layer_{len(hidden)}"
+            net["params"][last]["kernel"] *= output_scale
         noise = tuple(dropout.init(k, w) for k, w in zip(keys, hidden, strict=True))
         return {"network": net, "noise": noise, "input": unscaled(features)}
 

@@ -10,8 +10,9 @@ from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math.circles import entries
+from pegasus_jax.runs import first
 from pegasus_jax.runs.logged import read_config
-from pegasus_jax.tasks import cost_check, user_code
+from pegasus_jax.tasks import constrained, cost_check, guide, user_code
 from pegasus_jax.types import Task
 
 RESETS = 20  # of an environment that may be reset without need
@@ -24,7 +25,8 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     Raises ConfigError, in one line, for a cost that cannot be learned from and readings that cannot be right. The cost
     is looked at first: a mistake in it moves no robot.
     """
-    if config.cost is None:
+    guide.check(config, task)
+    if config.cost is None and task.constraint is None:
         return []
     low, high = tasks.observation_limits(config, task)
     facts = cost_check.Facts(
@@ -37,7 +39,11 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
         task.success,
         task.circles,
     )
-    notes = cost_check.notes(task.cost.of_state, cost_check.beside(facts, task), f"cost={shown(config.cost)}")
+    limits = constrained.notes(task.constraint, facts, f"constraint={shown(config.constraint)}")
+    if config.cost is None:
+        return limits
+    beside = cost_check.beside(facts, task)
+    notes = [*cost_check.notes(task.cost.of_state, beside, f"cost={shown(config.cost)}"), *limits]
     stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)
@@ -128,7 +134,7 @@ def report(config: Config) -> list[str]:
     given = bool(config.start_mean)
     set_precision(config)
     asked, config = config, tasks.resolve(config)
-    task = build(replace(config, seed=0)).task
+    task = build(replace(first.loaded(config), seed=0)).task
     notes = circles_found(asked, config) + before_training(config, task, 1 if given else RESETS)
     notes += read_config(config, task)[1]
     start = jnp.asarray(task.start_mean, float)

@@ -12,7 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from pegasus_jax.checks import FUNCTION, ConfigError, called, did_you_mean, shown
-from pegasus_jax.config import KINDS, TASKS, Config, uses
+from pegasus_jax.config import KINDS, TASKS, Config, Explore, uses
 from pegasus_jax.presets import WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.removed import refuse, today
@@ -80,14 +80,14 @@ def check_used(task: str, given: Mapping[str, Any]) -> None:
 
 
 def used_by() -> dict[str, tuple[str, ...]]:
-    """Setting -> the tasks that use it, of those settings that describe a plant."""
+    """Setting -> the tasks that use it, of those settings that describe a plant, or how it is explored."""
     found: dict[str, tuple[str, ...]] = {}
     for f in dataclasses.fields(Config):
         if f.metadata.get("of"):
             using, inner = tuple(task for task in TASKS if uses(task, f.name)), getattr(Config, f.name)
             names = leaves(inner, f"{f.name}.") if dataclasses.is_dataclass(inner) else [f.name]
             found |= dict.fromkeys(names, using)
-    return found
+    return found | {f"explore.{f.name}": TASKS for f in dataclasses.fields(Explore) if f.metadata.get("of")}
 
 
 def _nearest_of(task: str, choices: Sequence[str]) -> str:

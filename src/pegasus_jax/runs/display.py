@@ -196,6 +196,7 @@ def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
         f"{solved} of {len(rows)} seeds solved" if measured and several else "",
         f"model errors {np.median(errors):.1f} times as large as predicted" if errors else "",
         f"{skipped} updates skipped" if skipped else "",
+        limits(rows),
         f"({sum(first['seconds'].values()):.0f} s, {first['seconds']['compile']:.0f} s of it compiling)",
     ]
     return "  ".join(part for part in parts if part)
@@ -220,6 +221,24 @@ def learned(rows: Sequence[dict[str, Any]]) -> str:
         parts.append(f"imagined cost {imagined:.3f}")
     kept = all(row.get("replaced") is False for row in rows)
     return f"policy {'kept' if kept else 'now'}: {', '.join(parts)}" if parts else ""
+
+
+def limits(rows: Sequence[dict[str, Any]]) -> str:
+    """How a trial's episodes kept to the constraint, and how likely the policies break it; "" without one."""
+    if "constraint_rows" not in rows[0]:
+        return ""
+    text = f"constraint broken at {_mean(rows, 'constraint_rows'):.0%} of the rows"
+    expected = _mean(rows, "constraint_expected")
+    return text if expected is None else f"{text}, by the policy now in {expected:.0%} of its episodes as imagined"
+
+
+def limits_line(rows: Sequence[dict[str, Any]]) -> str:
+    """In how many of a run's episodes the constraint was broken, and how many ended early; "" without one."""
+    broken = [row for row in rows if row.get("constraint_broken")]
+    if not any("constraint_broken" in row for row in rows):
+        return ""
+    early = sum(row["ended"] == "terminated" for row in broken)
+    return f"constraint broken in {len(broken)} of {len(rows)} episodes; {early} of these ended early"
 
 
 def best_line(rows: Sequence[dict[str, Any]], trial: int) -> str:

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import episode, tasks
+from pegasus_jax.episode import Episode
+from pegasus_jax.imagine.limits import margin
 from pegasus_jax.runs import checkpoint, restore
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.runs.programs import Program
@@ -44,6 +46,15 @@ def saturated(u: Any, task: Task) -> np.ndarray:
     margin = 0.01 * (high - low)
     u = np.asarray(u)
     return np.mean((u < low + margin) | (u > high - margin), axis=(-2, -1))
+
+
+def kept_to(ran: Episode, task: Task) -> dict[str, Any]:
+    """Whether an episode broke the task's constraint, and the share of its rows that did; nothing without one."""
+    if task.constraint is None:
+        return {}
+    x = np.asarray(ran.trajectory.x)[1:]
+    over = np.asarray(margin(jnp.asarray(x, float), task.constraint)) > 0
+    return {"constraint_broken": bool(over.any()), "constraint_rows": float(over.mean()) if over.size else 0.0}
 
 
 def evaluate_run(

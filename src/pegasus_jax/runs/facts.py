@@ -37,6 +37,7 @@ def of_task(task: Task) -> dict[str, Any]:
         **{name: float(getattr(task, name)) for name in NUMBERS},
         **({"circles": [list(pair) for pair in task.circles]} if task.circles else {}),
         **asked(task),
+        **({"constraint_bound": float(task.constraint.bound)} if task.constraint else {}),
         **({} if digest is None else {"mjcf_digest": digest}),
     }
 
@@ -76,8 +77,11 @@ def to_task(found: Any, where: str) -> Task:
         }
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{where} is damaged: its task has no usable {str(error) or 'facts'}") from error
+    from pegasus_jax.imagine.limits import Constraint
     from pegasus_jax.types import Cost, Task
 
+    if "constraint_bound" in found:
+        known["constraint"] = Constraint(unknown_cost, _numbers([found["constraint_bound"]], 1)[0])
     cost = Cost(unknown_cost, unknown_cost, lambda factor: cost)  # as wide as may be asked: it is never computed
     task = Task(plant=None, cost=cost, **known)
     return _asking(task, found, where) if "terms" in found else task

@@ -15,7 +15,7 @@ from pegasus_jax.assembly.experiments import build, compose, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.learn.data import grow
-from pegasus_jax.runs import restore, writers
+from pegasus_jax.runs import first, restore, writers
 from pegasus_jax.runs.display import Display
 from pegasus_jax.runs.logged import NONE, Logs
 from pegasus_jax.runs.programs import Program, is_main_process
@@ -46,9 +46,10 @@ def opened(config: Config, seeds: Sequence[int], mesh: Mesh | None = None, logs:
     JAX has the config's precision from here on.
     """
     set_precision(config)
-    experiment = build(replace(config, seed=0), mesh)  # the seed is in the key, so that all share one program
+    loaded = first.loaded(config)
+    experiment = build(replace(loaded, seed=0), mesh)  # the seed is in the key, so that all share one program
     if logs.rows:
-        experiment = compose(config, experiment.task, mesh=mesh, logged=logs.rows)
+        experiment = compose(loaded, experiment.task, mesh=mesh, logged=logs.rows)
     try:
         program = Program(experiment, config.search.steps, len(seeds), mesh)
         display = Display(config.trials, quiet=not is_main_process())

@@ -199,9 +199,9 @@ def same(run: Path, task: Task) -> None:
 def announce(run: Path, config: Config) -> None:
     """Say which modules of their user a config names, and where they are. Raises RunError for one inside the run."""
     inside = run.resolve()
-    paths = (config.env, config.reference, config.prior)
-    names = (config.cost, config.stop, config.goals, *(name for name in paths if ":" in str(name)))
-    modules = sorted({name.partition(":")[0] for name in names if isinstance(name, str)})
+    own = (config.cost, config.stop, config.goals, config.constraint, config.explore.policy)
+    names = (*own, *(name for name in (config.env, config.reference, config.prior) if ":" in str(name)))
+    modules = sorted({name.partition(":")[0] for name in names if isinstance(name, str) and ":" in name})
     for entry in (os.getcwd(), *sys.path) if modules else ():
         if Path(entry or ".").resolve().is_relative_to(inside):
             raise RunError(f"{entry or os.getcwd()} lies in {run}, and nothing is imported from there; go elsewhere")

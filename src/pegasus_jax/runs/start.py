@@ -170,7 +170,7 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     Impossible settings and logs end here, before anything is written.
     """
     from pegasus_jax.assembly.experiments import build
-    from pegasus_jax.runs import restore
+    from pegasus_jax.runs import first, restore
     from pegasus_jax.runs.check import RESETS, before_training, circles_found
     from pegasus_jax.runs.logged import read_config
     from pegasus_jax.tasks import resolve
@@ -180,8 +180,8 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
         restore.announce(asked.resumed, config)
         build(replace(config, seed=0), mesh)
         return config, None
-    config = resolve(asked.config)
-    task = build(replace(config, seed=0), mesh).task
+    config = first.found(resolve(asked.config))
+    task = build(replace(first.loaded(config), seed=0), mesh).task
     resets = 1 if asked.config.start_mean else RESETS  # who says where episodes start has nobody reset a robot
     from pegasus_jax.runs.begin import checked
 
@@ -198,7 +198,8 @@ def _summed_up(asked: Asked) -> None:
 
     for seed, run in asked.runs.items():
         told = display.best_line(store.trials(run), restore.best(run))
-        print(f"seed {seed}: {told}" if len(asked.runs) > 1 else told)
+        for line in filter(None, (display.limits_line(store.trials(run)), told)):
+            print(f"seed {seed}: {line}" if len(asked.runs) > 1 else line)
     home = asked.home
     print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(asked.runs.values()))})")
 

@@ -306,7 +306,8 @@ def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None =
     """The trial after which the best policy was learned, judged by the rows of trials.jsonl, of which there is one.
 
     Where every policy was evaluated, that with the highest success rate, and of these with the lowest mean cost. Else
-    by its own episodes on the plant: that of which most succeeded, and of these with the lowest mean cost;
+    by its own episodes on the plant: that of which most succeeded, of these the one that broke a constraint least
+    often, and of these the one with the lowest mean cost;
     `last_episode` is one more than there are rows. What a fault or a person cut short does not count. A policy that
     never ran is chosen only where none ran: the last one. Among equals it is the latest. With `first` 0 one that was
     learned before the first episode is among them.
@@ -315,11 +316,12 @@ def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None =
 
     if all(row["mean_cost"] is not None and row["success_rate"] is not None for row in rows):
         return max(rows, key=lambda row: (row["success_rate"], -row["mean_cost"], row["trial"]))["trial"]
-    own: dict[int, list[tuple[float, float]]] = {}  # of each policy, (failed, cost) of its episodes
+    own: dict[int, list[tuple[float, ...]]] = {}  # of each policy, (failed, broke the constraint, cost) of its episodes
     for row in [*rows, *([last_episode] if last_episode else [])]:
         learned = row["policy"] or (first == 0 and not row["random"])
         if learned and row["episode_cost"] is not None and row["ended"] not in CUT:
-            own.setdefault(row["policy"], []).append((1.0 - row["episode_success"], row["episode_cost"]))
+            broke = float(row.get("constraint_broken", False))
+            own.setdefault(row["policy"], []).append((1.0 - row["episode_success"], broke, row["episode_cost"]))
     if not own:
         return rows[-1]["trial"]
     return min(own, key=lambda policy: (*np.mean(own[policy], 0), -policy))

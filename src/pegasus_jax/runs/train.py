@@ -24,14 +24,13 @@ from pegasus_jax.logs.read import Logged
 from pegasus_jax.runs import begin, checkpoint, config_io, logged, restore, store, writers
 from pegasus_jax.runs.collect import collected, stacked
 from pegasus_jax.runs.display import learned, summary
-from pegasus_jax.runs.evaluation import UNMEASURED, evaluate, saturated
+from pegasus_jax.runs.evaluation import UNMEASURED, evaluate, kept_to, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
 from pegasus_jax.runs.programs import gather, is_main_process
 from pegasus_jax.runs.stuck import stuck
 from pegasus_jax.runs.writers import Row, part
-from pegasus_jax.types import RunState, Trajectory
+from pegasus_jax.types import RunState, Task, Trajectory
 
-# What `improved` says of a trial that has not improved anything.
 UNKNOWN: dict[str, Any] = {
     "fit_loss": None,
     "objective_first": None,
@@ -133,7 +132,7 @@ def of_logs(job: Job, states: RunState) -> tuple[RunState, list[Row]]:
     config, task, program = job.config, job.experiment.task, job.program
     job.display.phase(1, "read")
     logs = job.logs.episodes()
-    states, found = logged.added(states, logs, job.experiment), [UNKNOWN] * len(job.seeds)
+    states, found = logged.added(states, logs, job.experiment), [unknown(task)] * len(job.seeds)
     if config.explore.trials < 2:
         states, found = improved(job, states, 1)
     evaluation = evaluated(job, states, 1)
@@ -162,7 +161,7 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Ro
     judged = trial > first_search(config)
     calibration = gather(program("calibrate", states, trajectories)) if judged else np.full(len(episodes), np.nan)
     # Line 4: add the episode to the data.
-    states, found = program("add_episode", states, trajectories), [UNKNOWN] * len(episodes)
+    states, found = program("add_episode", states, trajectories), [unknown(task)] * len(episodes)
     # Lines 5 and 6: fit the model, search a policy; not where the next episode is random too, and needs no policy.
     if trial >= config.explore.trials:
         states, found = improved(job, states, trial, trajectories)
@@ -179,12 +178,18 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Ro
             "ended": ran.ended,
             **evaluation[index],
             **found[index],
+            **kept_to(ran, task),
             "saturated": float(saturated(ran.trajectory.u, task)),
             "calibration": known(calibration[index]),
             "seconds": seconds,
         }
         for index, ran in enumerate(episodes)
     ]
+
+
+def unknown(task: Task) -> dict[str, Any]:
+    """What `improved` says of a trial that has not improved anything."""
+    return UNKNOWN if task.constraint is None else UNKNOWN | {"constraint_expected": None}
 
 
 def improved(
@@ -232,6 +237,7 @@ def improved(
             "replaced": bool(successor.replaced[index]),
             "gradient_norm": float(np.median(norm[index])),
             "skipped_updates": int(skipped[index]),
+            **({} if successor.chance is None else {"constraint_expected": float(successor.chance[index])}),
         }
         for index in range(len(skipped))
     ]

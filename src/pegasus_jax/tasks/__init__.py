@@ -18,7 +18,7 @@ from pegasus_jax.checks import ConfigError, check_range, did_you_mean
 from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
 from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.math import circles
-from pegasus_jax.tasks import circled, priors, sensed, terms, user_code
+from pegasus_jax.tasks import circled, constrained, guide, priors, sensed, terms, user_code
 from pegasus_jax.tasks.signals import FILES, named, with_signals
 from pegasus_jax.tasks.starts import from_starts
 from pegasus_jax.tasks.terms import whole as whole
@@ -109,7 +109,11 @@ def of_config(config: Config) -> Task:
     if config.starts and task.environment is None:
         task = from_starts(task, config.starts)
     task = sensed.sensed(with_signals(task, config), config.sensors)
-    return task if config.prior is None else task._replace(prior=priors.of_config(config, task))
+    return task._replace(
+        constraint=constrained.of_config(config, task),
+        guide=guide.of_config(config, task),
+        prior=priors.of_config(config, task),
+    )
 
 
 def rates_of(task: Task) -> tuple[int, ...]:
@@ -219,6 +223,8 @@ def _complete(config: Config) -> None:
     if config.env is None or config.cost is None:
         raise ConfigError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
     terms.agree(user_code.load("cost", config.cost), *named(config))
+    if config.constraint is not None:
+        user_code.load("constraint", config.constraint)
     module, colon, _ = config.env.partition(":")
     if colon:  # Gymnasium imports it, to register what is in it
         user_code.importing(f"env={config.env}", module)

@@ -16,8 +16,10 @@ from pegasus_jax.types import Array, Task
 FILE = ".xml"
 
 
-def of_config(config: Config, task: Task) -> Simulate:
-    """The config's prior. Raises ConfigError, in one line, for one that there is not or that does not suit the task."""
+def of_config(config: Config, task: Task) -> Simulate | None:
+    """The config's prior, or None. Raises ConfigError, in one line, for one that there is not or that does not suit the task."""
+    if config.prior is None:
+        return None
     what = f"prior={shown(config.prior)}"
     if isinstance(config.prior, str) and config.prior.endswith(FILE):
         return checked(what, of_file(what, config, task), task)

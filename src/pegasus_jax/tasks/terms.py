@@ -73,8 +73,9 @@ def whole(task: Task, cost: Cost | None = None) -> Task:
     task = task._replace(terms=terms, memory=memory)
     if not memory.names:
         return task._replace(cost=given)
-    stop = task.stop
+    stop, limits = task.stop, task.constraint
     return task._replace(
+        constraint=None if limits is None else limits._replace(of_state=lambda x: limits.of_state(x[:states])),
         cost=of_terms(task, given.of_state) if terms else blind_to_memory(given, states),
         stop=None if stop is None else wraps(stop)(lambda x: stop(x[:states])),
     )
