@@ -166,7 +166,7 @@ def test_controls_that_are_no_numbers_or_too_many_are_not_kept(
 def test_a_policy_of_another_kind_is_stablehlo_only(runs: dict[str, Path], tmp_path: Path) -> None:
     config, experiment, state = restore.restored(runs["mlp"])
     policy = experiment.policy._replace(apply=lambda params, noise, x: 3 * jnp.cos(x[:1]))
-    own: Any = SimpleNamespace(policy="a function of its user", x64=False)
+    own: Any = SimpleNamespace(policy="a function of its user", x64=False, state_names=())
     learned = Learned("run", 1, own, experiment.task, policy, state.policy.params)
     for format in ("numpy", "c", "onnx"):
         with pytest.raises(ConfigError, match=f"format={format} cannot write .* the nearest is format=stablehlo"):
