@@ -11,7 +11,8 @@ from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.runs import checkpoint, config_io, store
 from pegasus_jax.runs.restore import precision
-from pegasus_jax.types import Task, Trajectory
+from pegasus_jax.task import Task
+from pegasus_jax.types import Trajectory
 
 TINY = {"task": "cartpole", "model.hidden": "[3]", "policy.hidden": "[3]", "search.steps": "2", "search.particles": "8"}
 

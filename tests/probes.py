@@ -1,6 +1,6 @@
 """Probe tasks: problems with known answers, small enough to debug an algorithm in seconds. And a small rig of pieces.
 
-A probe is a `types.Task` whose plant is three lines of algebra. Where the answer is known in closed form, it is
+A probe is a `task.Task` whose plant is three lines of algebra. Where the answer is known in closed form, it is
 computed here in NumPy, independently of the package.
 """
 
@@ -21,7 +21,8 @@ from pegasus_jax.models import dropout
 from pegasus_jax.models.bnn import bnn
 from pegasus_jax.policies.mlp import mlp
 from pegasus_jax.policies.squash import SQUASHES, to_limits
-from pegasus_jax.types import Dynamics, Policy, Prediction, Task, Trajectory
+from pegasus_jax.task import Task
+from pegasus_jax.types import Dynamics, Policy, Prediction, Trajectory
 
 # What the fits and searches of a run are compiled with, and tests are not where they have the choice (conftest.py).
 _SWITCH = "xla_cpu_use_fusion_emitters"

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from pegasus_jax import config, tasks
+from pegasus_jax import config, config_models, config_plant, config_policies, tasks
 from pegasus_jax.assembly.experiments import EXPLORATIONS, build, compose, set_precision
 from pegasus_jax.assembly.pieces import dropout_of, policy_of
 from pegasus_jax.assembly.searchers import search_of, start
@@ -29,9 +29,9 @@ from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, same, tin
 
 def test_the_choices_of_a_config_are_the_pieces_there_are():
     """config.py cannot import the pieces; it lists their names, and this keeps the lists true."""
-    assert tuple(INITIALIZERS) == config.INITIALIZERS
-    assert tuple(SQUASHES) == config.SQUASHES
-    assert tuple(EXPLORATIONS) == config.EXPLORATIONS
+    assert tuple(INITIALIZERS) == config_models.INITIALIZERS
+    assert tuple(SQUASHES) == config_policies.SQUASHES
+    assert tuple(EXPLORATIONS) == config_plant.EXPLORATIONS
 
 
 @pytest.mark.parametrize("kind", DROPOUTS)

@@ -23,8 +23,8 @@ from pegasus_jax.exports.learned import Learned, said
 from pegasus_jax.exports.parity import observations
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs import restore, store
+from pegasus_jax.task import Task
 from pegasus_jax.tasks.circled import of_angles
-from pegasus_jax.types import Task
 
 FORMATS = ("numpy", "c", "onnx", "stablehlo")
 needs_cc = pytest.mark.skipif(not any(map(as_c.shutil.which, as_c.COMPILERS)), reason="needs a C compiler")

@@ -17,7 +17,8 @@ from pegasus_envs.gym_plant import env_plant, env_spec, make_env, period
 from pegasus_jax import episode, interrupt
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.runs import config_io, store
-from pegasus_jax.types import Cost, Task
+from pegasus_jax.task import Task
+from pegasus_jax.types import Cost
 from probes import cart, tiny
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]

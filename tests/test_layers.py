@@ -16,16 +16,17 @@ ROOT = Path(__file__).resolve().parents[1]
 # Folders end in a dot. What one layer holds side by side does not import each other.
 LAYERS = {
     0: "types checks interrupt",
-    1: "config_models shapes memory sharding vectorized math.",
-    2: "config models. imagine. episode",
-    3: "presets policies. learn.",
-    4: "tasks. pilco. experiment",
-    5: "assembly. logs.",
-    6: "runs.",
-    7: "viz. exports.",
-    8: "cli. deploy __init__",
+    1: "config_models shapes sharding task vectorized math.",
+    2: "config_plant config_policies memory",
+    3: "config models. imagine. episode",
+    4: "presets policies. learn.",
+    5: "tasks. pilco. experiment",
+    6: "assembly. logs.",
+    7: "runs.",
+    8: "viz. exports.",
+    9: "cli. deploy __init__",
 }
-APPLICATION = 6  # the first layer that knows of files, terminals and people
+APPLICATION = 7  # the first layer that knows of files, terminals and people
 
 # Foreign packages that only some layers may import.
 APPLICATION_ONLY = {"omegaconf", "hydra", "rich", "matplotlib", "tensorboardX"}
@@ -174,31 +175,31 @@ def test_checker_accepts_a_clean_package(tmp_path: Path) -> None:
     assert violations(plant(tmp_path, {})) == []
 
 
-ROLLOUT = "imagine.rollout (layer 2) imports"
+ROLLOUT = "imagine.rollout (layer 3) imports"
 
 
 @pytest.mark.parametrize(
     ("file", "text", "complaint"),
     [
-        ("imagine/rollout.py", "from pegasus_jax.learn.search import a\n", f"{ROLLOUT} learn.search (layer 3)"),
-        ("imagine/rollout.py", "from ..learn.search import a\n", f"{ROLLOUT} learn.search (layer 3)"),
+        ("imagine/rollout.py", "from pegasus_jax.learn.search import a\n", f"{ROLLOUT} learn.search (layer 4)"),
+        ("imagine/rollout.py", "from ..learn.search import a\n", f"{ROLLOUT} learn.search (layer 4)"),
         ("imagine/rollout.py", "def f():\n    import pegasus_jax.learn.search\n", f"rollout.py:2: {ROLLOUT} learn"),
-        ("imagine/rollout.py", "from pegasus_jax import gradient_search\n", f"{ROLLOUT} __init__ (layer 8)"),
+        ("imagine/rollout.py", "from pegasus_jax import gradient_search\n", f"{ROLLOUT} __init__ (layer 9)"),
         ("imagine/rollout.py", "if TYPE_CHECKING:\n    from ..models.bnn import b\n", f"{ROLLOUT} models.bnn"),
         (
             "math/angles.py",
             "from pegasus_jax.models import bnn\n",
-            "math.angles (layer 1) imports models.bnn (layer 2)",
+            "math.angles (layer 1) imports models.bnn (layer 3)",
         ),
-        ("math/angles.py", "import pegasus_jax.models\n", "math.angles (layer 1) imports models.__init__ (layer 2)"),
-        ("models/bnn.py", "from ..tasks import cartpole\n", "models.bnn (layer 2) imports tasks.__init__ (layer 4)"),
+        ("math/angles.py", "import pegasus_jax.models\n", "math.angles (layer 1) imports models.__init__ (layer 3)"),
+        ("models/bnn.py", "from ..tasks import cartpole\n", "models.bnn (layer 3) imports tasks.__init__ (layer 5)"),
         ("imagine/costs.py", "from .rollout import f\n", "cycle: imagine.costs -> imagine.rollout -> imagine.costs"),
         ("runs/store.py", "from pegasus_jax.viz import curve\n", "import cycle: runs.store -> viz.curve -> runs.store"),
         ("assembly/experiments.py", "from pegasus_envs import cartpole\n", "only tasks. may import pegasus_envs"),
         (
             "assembly/experiments.py",
             "from omegaconf import OmegaConf\n",
-            "assembly.experiments (layer 5) imports omegaconf",
+            "assembly.experiments (layer 6) imports omegaconf",
         ),
         ("types.py", "import rich.progress\n", "types (layer 0) imports rich"),
         ("helpers.py", "", "helpers.py: unknown: give helpers a layer in test_layers.py"),

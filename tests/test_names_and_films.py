@@ -18,7 +18,7 @@ from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.exports.write import contract_of, export
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.check import report
-from pegasus_jax.types import Task
+from pegasus_jax.task import Task
 from pegasus_jax.viz import run_plots
 from pegasus_jax.viz.video import HEIGHT, STRIP, WIDTH, film, fitted
 

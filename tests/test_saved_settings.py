@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pegasus_jax import config, config_models
+from pegasus_jax import config, config_models, config_plant, config_policies
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import BNN, MATCHINGS, MLP, Config, Explore, Fit, Period, Search
 from pegasus_jax.presets import ALGORITHMS
@@ -36,7 +36,7 @@ configs = st.builds(
         MLP,
         hidden=layers,
         dropout=st.floats(0, 0.99),
-        squash=st.sampled_from(config.SQUASHES),
+        squash=st.sampled_from(config_policies.SQUASHES),
         initializer=st.sampled_from(config.INITIALIZERS),
     ),
     fit=st.builds(Fit, steps=whole(1), batch_size=whole(1), learning_rate=positive),
@@ -56,7 +56,7 @@ configs = st.builds(
         state_noise=st.floats(0, 10),
         period=st.builds(Period, *[whole(0)] * 5),
     ),
-    explore=st.builds(Explore, trials=st.integers(0, 10**4), kind=st.sampled_from(config.EXPLORATIONS)),
+    explore=st.builds(Explore, trials=st.integers(0, 10**4), kind=st.sampled_from(config_plant.EXPLORATIONS)),
 )
 
 

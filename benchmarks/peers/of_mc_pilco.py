@@ -42,7 +42,8 @@ from pegasus_jax.pilco import kernels
 from pegasus_jax.pilco.gp import Posterior
 from pegasus_jax.pilco.kernels import inputs_of
 from pegasus_jax.pilco.rbf import regress
-from pegasus_jax.types import Array, Params, Task
+from pegasus_jax.task import Task
+from pegasus_jax.types import Array, Params
 
 # What makes a size comparable: a model and a policy that both have, each particle's own cost, room for the rows alone.
 SETTINGS = {

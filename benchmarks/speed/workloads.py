@@ -23,7 +23,16 @@ from pegasus_jax.imagine.objective import objective
 from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.math.angles import encode
 from pegasus_jax.runs import config_io
-from pegasus_jax.types import Array, Cost, Params, Period, RunState, Scenarios, Task, Trajectory
+from pegasus_jax.task import Task
+from pegasus_jax.types import (
+    Array,
+    Cost,
+    Params,
+    Period,
+    RunState,
+    Scenarios,
+    Trajectory,
+)
 
 # Every iteration alike, as the paper's and the peers' are: what a search refines by is another program.
 ALIKE = {"search.standardized_noise": "false", "search.refine_fraction": "0", "search.init": "better"}

@@ -66,6 +66,8 @@ if TYPE_CHECKING:
     from pegasus_jax.runs.controller import controller as controller
     from pegasus_jax.runs.start import preset as preset
     from pegasus_jax.runs.start import train as train
+    from pegasus_jax.task import Signal as Signal
+    from pegasus_jax.task import Task as Task
     from pegasus_jax.types import Batch as Batch
     from pegasus_jax.types import Cost as Cost
     from pegasus_jax.types import Dataset as Dataset
@@ -81,8 +83,6 @@ if TYPE_CHECKING:
     from pegasus_jax.types import Rollout as Rollout
     from pegasus_jax.types import RunState as RunState
     from pegasus_jax.types import Scenarios as Scenarios
-    from pegasus_jax.types import Signal as Signal
-    from pegasus_jax.types import Task as Task
     from pegasus_jax.types import TrainState as TrainState
     from pegasus_jax.types import Trajectory as Trajectory
     from pegasus_jax.vectorized import Vectorized as Vectorized
@@ -120,7 +120,8 @@ _NAMES = {
     "policies.wrap": "of_pair",
     "pilco.rbf": "rbf",
     # the values that pass between them
-    "types": "Task Cost Trajectory Dataset Batch Dynamics Prediction Dropout Policy Memory Hindsight Signal Scenarios"
+    "task": "Task Signal",
+    "types": "Cost Trajectory Dataset Batch Dynamics Prediction Dropout Policy Memory Hindsight Scenarios"
     " Period Rollout TrainState ModelLearner PolicyOptimizer RunState",
     "vectorized": "Vectorized",
 }

@@ -12,79 +12,25 @@ from typing import Any
 
 from pegasus_jax import checks
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.config_models import BNN, GP, INITIALIZERS, SSGP, Lagrangian, setting
+from pegasus_jax.config_models import BNN, GP, SSGP, Lagrangian, setting
+from pegasus_jax.config_plant import EVERY, Explore, Sensors
+from pegasus_jax.config_policies import MLP, RBF, Linear
 
 MANEUVERS = ("knife_edge", "belly_up", "corkscrew", "depth_change")
 GYM = "gym"  # the task that `env=` and `cost=` describe
 MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe
 TASKS = ("cartpole", "double_cartpole", *(f"swimmer_{maneuver}" for maneuver in MANEUVERS), GYM, MJCF)
 OWN = (GYM, MJCF)
-EVERY = ("*",)
 CONSTANTS = (GYM, "cartpole", "double_cartpole")  # the tasks that have `env_args`
 
-SQUASHES = ("tanh", "sine")
-EXPLORATIONS = ("uniform", "walk")
 MATCHINGS = ("always", "narrow", "never")
 COST_ESTIMATORS = ("gaussian", "particles")
 OBSERVATION_NOISES = ("model", "plant")
-VELOCITIES = ("none", "difference", "filter")
 INIT_PARTS = ("policy", "model")
 INITS = ("previous", "better", "fresh")
 LEGS = (2, 6)
 SUCCESSORS = ("always", "better")
 DATA_CONTROLS = ("sent", "before")
-
-
-@dataclass(frozen=True)
-class MLP:
-    """A ReLU network controller."""
-
-    kind: str = setting("mlp", "")
-    hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
-    dropout: float = setting(0.0, "drop probability of the hidden units; 0 is a deterministic policy")
-    squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
-    input_units: tuple[float, ...] = setting(
-        (), "unit of each state that is not an angle, one number each; []: the plant's units"
-    )
-    initializer: str = setting("glorot", "initial weights: glorot, orthogonal")
-
-    def __post_init__(self) -> None:
-        checks.typed("policy", self)
-        checks.kind("policy", self.kind, "mlp")
-        checks.layers("policy.hidden", self.hidden)
-        for name, choices in (("squash", SQUASHES), ("initializer", INITIALIZERS)):
-            checks.choice(f"policy.{name}", getattr(self, name), choices)
-        checks.check_range("policy.dropout", self.dropout, 0, 0.99)
-        for unit in self.input_units:
-            checks.check_range("policy.input_units", unit, 0, open_low=True)
-
-
-@dataclass(frozen=True)
-class RBF:
-    """A controller of radial basis functions: the mean of a Gaussian process, PILCO's."""
-
-    kind: str = setting("rbf", "")
-    num_centers: int = setting(30, "radial basis functions")
-    squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
-
-    def __post_init__(self) -> None:
-        checks.typed("policy", self)
-        checks.kind("policy", self.kind, "rbf")
-        checks.size("policy.num_centers", self.num_centers)
-        checks.choice("policy.squash", self.squash, SQUASHES)
-
-
-@dataclass(frozen=True)
-class Linear:
-    """A linear controller of the encoded state."""
-
-    kind: str = setting("linear", "")
-    squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
-
-    def __post_init__(self) -> None:
-        checks.typed("policy", self)
-        checks.kind("policy", self.kind, "linear")
-        checks.choice("policy.squash", self.squash, SQUASHES)
 
 
 @dataclass(frozen=True)
@@ -250,54 +196,6 @@ class Analytic:
         checks.choice("search.init", self.init, INITS[:2])
 
 
-@dataclass(frozen=True)
-class Explore:
-    """The first episodes, before there is a model."""
-
-    trials: int = setting(1, "episodes of random controls")
-    kind: str = setting("uniform", "uniform: a fresh control each step; walk: a random walk")
-    amplitude: float | None = setting(
-        None, "part of the control range that these grow to over an episode; null: all of it at once", EVERY
-    )
-    policy: str | Callable | None = setting(  # noqa: RUF009 (frozen)
-        None,
-        "module:function, observation -> controls, or a run's folder; with amplitude= random ones are added",
-        EVERY,
-    )
-
-    def __post_init__(self) -> None:
-        checks.typed("explore", self)
-        checks.size("explore.trials", self.trials, 0)
-        checks.choice("explore.kind", self.kind, EXPLORATIONS)
-        if self.amplitude is not None:
-            checks.check_range("explore.amplitude", self.amplitude, 0, 1, open_low=True)
-
-
-@dataclass(frozen=True)
-class Sensors:
-    """What a robot measures, and when; as `Config.sensors`."""
-
-    measured: tuple[int, ...] = setting((), "the entries of the observation that there are sensors for; []: all")
-    delay: int = setting(0, "control periods from a state until the policy sees it, or from a control until it acts")
-    velocity: str = setting(
-        "none", "the rates of what is measured are computed: by difference, or by filter, its low-pass; or none are"
-    )
-    cutoff: float | None = setting(None, "of sensors.velocity=filter [Hz]; null: a fifth of the control rate")
-
-    def __post_init__(self) -> None:
-        checks.typed("sensors", self)
-        checks.different("sensors.measured", self.measured)
-        checks.size("sensors.delay", self.delay, 0)
-        checks.choice("sensors.velocity", self.velocity, VELOCITIES)
-        if self.cutoff is not None:
-            checks.check_range("sensors.cutoff", self.cutoff, 0, open_low=True)
-            if self.velocity != "filter":
-                raise ConfigError(
-                    f"sensors.cutoff={self.cutoff:g} is of no use with sensors.velocity={self.velocity}; the nearest is"
-                    " sensors.velocity=filter"
-                )
-
-
 Model = BNN | GP | SSGP | Lagrangian
 
 
@@ -314,10 +212,10 @@ class Config:
     )
     x64: bool = setting(False, "numbers of 64 bits, not 32")
     model: Model = BNN()  # noqa: RUF009 (frozen)
-    policy: MLP | RBF | Linear = MLP()
+    policy: MLP | RBF | Linear = MLP()  # noqa: RUF009 (frozen)
     fit: Fit | LBFGS = Fit()
     search: Search | Analytic = Search()
-    explore: Explore = Explore()
+    explore: Explore = Explore()  # noqa: RUF009 (frozen)
     # The plant: its sensors, and what the task leaves to you: of a gym's or an mjcf's task, and a swimmer's legs.
     sensors: Sensors = setting(Sensors(), "", EVERY)  # noqa: RUF009 (frozen)
     history: int = setting(1, "observations and controls that make a state, the newest and those before it", EVERY)

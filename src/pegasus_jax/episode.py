@@ -10,7 +10,8 @@ import numpy as np
 from pegasus_jax import interrupt
 from pegasus_jax import memory as recall
 from pegasus_jax.shapes import check_shape
-from pegasus_jax.types import Array, Key, Task, Trajectory
+from pegasus_jax.task import Task
+from pegasus_jax.types import Array, Key, Trajectory
 
 CUT = ("error", "interrupted")  # how an episode can end by no doing of its policy
 

@@ -19,6 +19,7 @@ from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.models.calibration import calibration
 from pegasus_jax.shapes import check_shape
+from pegasus_jax.task import Task
 from pegasus_jax.types import (
     Array,
     Dataset,
@@ -30,7 +31,6 @@ from pegasus_jax.types import (
     PolicyOptimizer,
     Rollout,
     RunState,
-    Task,
     TrainState,
     Trajectory,
 )

@@ -13,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax.types import NO_MEMORY, Array, Key, Memory, Task, Trajectory
+from pegasus_jax.task import Task
+from pegasus_jax.types import NO_MEMORY, Array, Key, Memory, Trajectory
 
 __all__ = ["clock", "combined", "constant", "past_controls"]
 

@@ -16,8 +16,17 @@ from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.imagine import visited
 from pegasus_jax.models.residual import on_differences, residual
 from pegasus_jax.sharding import over_particles
+from pegasus_jax.task import Task
 from pegasus_jax.tasks.remembered import remembering
-from pegasus_jax.types import Array, Cost, Dynamics, Key, ModelLearner, Policy, PolicyOptimizer, Task
+from pegasus_jax.types import (
+    Array,
+    Cost,
+    Dynamics,
+    Key,
+    ModelLearner,
+    Policy,
+    PolicyOptimizer,
+)
 
 EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 

@@ -26,7 +26,8 @@ from pegasus_jax.pilco.ssgp import ssgp
 from pegasus_jax.policies.linear import linear
 from pegasus_jax.policies.mlp import mlp
 from pegasus_jax.policies.squash import SQUASHES, to_limits
-from pegasus_jax.types import Dropout, Dynamics, ModelLearner, Policy, Task
+from pegasus_jax.task import Task
+from pegasus_jax.types import Dropout, Dynamics, ModelLearner, Policy
 
 AT_REST = 0.05  # of the outgoing weights of a network controller, where there is a constraint
 

@@ -23,6 +23,7 @@ from pegasus_jax.memory import begin, steps
 from pegasus_jax.pilco import search as pilco
 from pegasus_jax.policies.scaled import inherited
 from pegasus_jax.sharding import Spread, together
+from pegasus_jax.task import Task
 from pegasus_jax.tasks.starts import start
 from pegasus_jax.types import (
     Array,
@@ -35,7 +36,6 @@ from pegasus_jax.types import (
     PolicyOptimizer,
     Rollout,
     Scenarios,
-    Task,
 )
 
 

@@ -7,8 +7,9 @@ import jax
 import numpy as np
 
 from pegasus_jax import memory as recall
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import sensed, terms
-from pegasus_jax.types import NO_MEMORY, Task
+from pegasus_jax.types import NO_MEMORY
 
 
 def observed(task: Task) -> tuple[Task, tuple[float, ...]]:
@@ -49,7 +50,8 @@ def asking(control: Callable[[Any], np.ndarray], task: Task, seed: int) -> tuple
     begin = jax.jit(lambda x: recall.begin(memory, jax.random.key(seed), x))
     shown, later = jax.jit(lambda m, x: see(m, x)[len(x) :]), jax.jit(advance)
     kept = begin(rest := np.zeros(len(task.state_names), np.float32))
-    later(kept, rest, np.zeros(len(task.control_names), np.float32)), shown(kept, rest)
+    later(kept, rest, np.zeros(len(task.control_names), np.float32))
+    shown(kept, rest)
 
     def act(t: int, x: np.ndarray) -> np.ndarray:
         nonlocal kept

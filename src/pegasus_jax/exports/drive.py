@@ -21,7 +21,8 @@ from pegasus_jax.exports.write import export
 from pegasus_jax.runs import restore, store
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.runs.files import write_whole
-from pegasus_jax.types import Task, Trajectory
+from pegasus_jax.task import Task
+from pegasus_jax.types import Trajectory
 
 SLACK = 0.1  # of a period, by which a control may follow the one before it too late
 FOLDER = "driven"  # in a run's folder

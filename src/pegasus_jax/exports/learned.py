@@ -10,8 +10,9 @@ import numpy as np
 from pegasus_jax import memory as recall
 from pegasus_jax.config import Config
 from pegasus_jax.math.circles import entries, to_state
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import sensed
-from pegasus_jax.types import Array, Params, Policy, Task
+from pegasus_jax.types import Array, Params, Policy
 
 
 class Learned(NamedTuple):

@@ -12,8 +12,8 @@ from pegasus_jax.exports.learned import Learned, along, function
 from pegasus_jax.runs import store
 from pegasus_jax.runs.controller import Controller
 from pegasus_jax.runs.restore import precision
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import sensed
-from pegasus_jax.types import Task
 
 OBSERVATIONS = 1000  # half of them stored, as far as there are so many
 EPISODE = 20  # observations between two resets of a controller that remembers

@@ -10,7 +10,7 @@ from pegasus_jax.logs.columns import SETTING, Column, Layout, numbers
 from pegasus_jax.logs.table import Table, names_of
 from pegasus_jax.math.circles import to_state
 from pegasus_jax.memory import measured
-from pegasus_jax.types import Task
+from pegasus_jax.task import Task
 
 JITTER = 0.05  # of a period, by which rows may come early or late without being interpolated
 GAP = 3.0  # periods without a row that end an episode

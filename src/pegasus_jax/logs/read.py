@@ -18,7 +18,8 @@ from pegasus_jax.logs import bags, minari_sets
 from pegasus_jax.logs.columns import layout
 from pegasus_jax.logs.episodes import Segment, periods, segments, with_rates
 from pegasus_jax.logs.table import Names, Table, names_of, of_csv, of_npz
-from pegasus_jax.types import Array, Task, Trajectory
+from pegasus_jax.task import Task
+from pegasus_jax.types import Array, Trajectory
 
 
 class Logged(NamedTuple):

@@ -12,7 +12,7 @@ import numpy as np
 from pegasus_jax import memory
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.math import circles
-from pegasus_jax.types import Task
+from pegasus_jax.task import Task
 
 # What others call the observations and the controls, where one array has all of them.
 OBSERVATIONS = ("observation", "observations", "obs", "x")

@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from pegasus_jax.math.angles import encode
 from pegasus_jax.memory import seen_angles
 from pegasus_jax.policies.squash import SQUASHES, to_limits
-from pegasus_jax.types import Array, Key, Params, Policy, Task
+from pegasus_jax.task import Task
+from pegasus_jax.types import Array, Key, Params, Policy
 
 
 def of_pair(

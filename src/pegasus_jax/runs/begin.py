@@ -16,7 +16,8 @@ from pegasus_jax.config import Config
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.memory import seen_names
 from pegasus_jax.runs import checkpoint, config_io, restore, store
-from pegasus_jax.types import RunState, Task, TrainState
+from pegasus_jax.task import Task
+from pegasus_jax.types import RunState, TrainState
 
 FOLDER = "init"
 

@@ -12,8 +12,8 @@ from pegasus_jax.config import Config
 from pegasus_jax.math.circles import entries
 from pegasus_jax.runs import first
 from pegasus_jax.runs.logged import read_config
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import constrained, cost_check, guide, user_code
-from pegasus_jax.types import Task
 
 RESETS = 20  # of an environment that may be reset without need
 EXACT = 1e-4  # of an entry's spread: what is left of it is rounding

@@ -13,8 +13,9 @@ from pegasus_jax.experiment import COLLECT, trial_key
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs.job import Job
 from pegasus_jax.runs.programs import gather, is_main_process
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import user_code
-from pegasus_jax.types import RunState, Task, Trajectory
+from pegasus_jax.types import RunState, Trajectory
 
 
 def collected(job: Job, states: RunState, trial: int) -> tuple[list[Episode], np.ndarray]:

@@ -11,7 +11,7 @@ from pegasus_jax.config import Config, Sensors
 from pegasus_jax.episode import drive
 from pegasus_jax.math.delays import MOST, Delay, delay_of, enough
 from pegasus_jax.runs.collect import failed
-from pegasus_jax.types import Task
+from pegasus_jax.task import Task
 
 EPISODES = 20  # at most, of an environment whose episodes end early
 

@@ -13,7 +13,8 @@ from pegasus_jax.imagine.limits import margin
 from pegasus_jax.runs import checkpoint, restore
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.runs.programs import Program
-from pegasus_jax.types import Key, Params, Task
+from pegasus_jax.task import Task
+from pegasus_jax.types import Key, Params
 
 UNMEASURED: dict[str, Any] = {"mean_cost": None, "success_rate": None}  # what `evaluate` says without episodes
 

@@ -14,7 +14,7 @@ import numpy as np
 from pegasus_jax.checks import RunError
 
 if TYPE_CHECKING:
-    from pegasus_jax.types import Task
+    from pegasus_jax.task import Task
 
 TEXTS = ("state_names", "control_names")
 ENTRIES = ("angles", "rates")  # of the state
@@ -78,7 +78,8 @@ def to_task(found: Any, where: str) -> Task:
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{where} is damaged: its task has no usable {str(error) or 'facts'}") from error
     from pegasus_jax.imagine.limits import Constraint
-    from pegasus_jax.types import Cost, Task
+    from pegasus_jax.task import Task
+    from pegasus_jax.types import Cost
 
     if "constraint_bound" in found:
         known["constraint"] = Constraint(unknown_cost, _numbers([found["constraint_bound"]], 1)[0])
@@ -91,9 +92,10 @@ def _asking(task: Task, found: Any, where: str) -> Task:
     """The task of the facts that `asked` has written; its goals are all 0."""
     import jax.numpy as jnp
 
+    from pegasus_jax.task import Signal
     from pegasus_jax.tasks.signals import of_times, table, times
     from pegasus_jax.tasks.terms import TERMS
-    from pegasus_jax.types import Cost, Signal
+    from pegasus_jax.types import Cost
 
     try:
         terms = [_text(term) for term in found["terms"]]

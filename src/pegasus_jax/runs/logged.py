@@ -20,7 +20,8 @@ from pegasus_jax.logs.read import Logged, read
 from pegasus_jax.runs import store
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.programs import gather
-from pegasus_jax.types import RunState, Task, Trajectory
+from pegasus_jax.task import Task
+from pegasus_jax.types import RunState, Trajectory
 
 FOLDER = "logged"  # in a run's folder
 

@@ -24,7 +24,8 @@ from pegasus_jax.config import Config
 from pegasus_jax.episode import verdict
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.runs import checkpoint, config_io, facts, logged, store
-from pegasus_jax.types import RunState, Task, TrainState
+from pegasus_jax.task import Task
+from pegasus_jax.types import RunState, TrainState
 
 Trial = int | str  # a number, or one of:
 LAST, BEST = "last", "best"

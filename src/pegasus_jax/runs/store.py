@@ -38,7 +38,8 @@ from pegasus_jax.runs.machine import about
 
 if TYPE_CHECKING:  # JAX is imported where it is needed: a command names its folder before it waits for that
     from pegasus_jax.episode import Episode
-    from pegasus_jax.types import Rollout, Task, Trajectory
+    from pegasus_jax.task import Task
+    from pegasus_jax.types import Rollout, Trajectory
 
 FILES = ("config.yaml", "run.json", "trials.jsonl", ".lock")
 FOLDERS = ("episodes", "logged", "imagined", "checkpoints", "tensorboard", "plots")

@@ -16,7 +16,8 @@ from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.job import first_states, opened
 from pegasus_jax.runs.train import learn
 from pegasus_jax.runs.writers import Row, Writer
-from pegasus_jax.types import RunState, Task
+from pegasus_jax.task import Task
+from pegasus_jax.types import RunState
 
 SOLVED = 0.9  # of a trial's evaluation episodes succeed
 

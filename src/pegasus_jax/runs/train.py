@@ -29,7 +29,8 @@ from pegasus_jax.runs.job import Job, first_states, opened
 from pegasus_jax.runs.programs import gather, is_main_process
 from pegasus_jax.runs.stuck import stuck
 from pegasus_jax.runs.writers import Row, part
-from pegasus_jax.types import RunState, Task, Trajectory
+from pegasus_jax.task import Task
+from pegasus_jax.types import RunState, Trajectory
 
 UNKNOWN: dict[str, Any] = {
     "fit_loss": None,

@@ -19,7 +19,8 @@ from pegasus_jax.experiment import Successor
 from pegasus_jax.runs import checkpoint, config_io, store
 from pegasus_jax.runs.programs import gather, is_main_process
 from pegasus_jax.runs.tensorboard import Board
-from pegasus_jax.types import RunState, Task
+from pegasus_jax.task import Task
+from pegasus_jax.types import RunState
 
 Row = dict[str, Any]  # a trial of one seed in numbers, as in trials.jsonl
 

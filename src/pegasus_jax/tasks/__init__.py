@@ -18,11 +18,12 @@ from pegasus_jax.checks import ConfigError, check_range, did_you_mean
 from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
 from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.math import circles
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import circled, constrained, guide, priors, sensed, terms, user_code
 from pegasus_jax.tasks.signals import FILES, named, with_signals
 from pegasus_jax.tasks.starts import from_starts
 from pegasus_jax.tasks.terms import whole as whole
-from pegasus_jax.types import Cost, Task
+from pegasus_jax.types import Cost
 
 if TYPE_CHECKING:
     from pegasus_envs.plant import Plant

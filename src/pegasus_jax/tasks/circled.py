@@ -8,7 +8,8 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.math import circles as pairs
-from pegasus_jax.types import Cost, Task
+from pegasus_jax.task import Task
+from pegasus_jax.types import Cost
 
 
 def of_angles(task: Task, circles: pairs.Circles) -> Task:

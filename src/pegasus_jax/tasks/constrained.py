@@ -8,8 +8,9 @@ from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.imagine.limits import Constraint
 from pegasus_jax.math.circles import to_observation
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import cost_check, user_code
-from pegasus_jax.types import Array, Task
+from pegasus_jax.types import Array
 
 
 def of_config(config: Config, task: Task) -> Constraint | None:

@@ -9,9 +9,9 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.math.circles import Circles, to_observation
+from pegasus_jax.task import Task
 from pegasus_jax.tasks.terms import box
 from pegasus_jax.tasks.user_code import blamed, definition, line_of, place_of
-from pegasus_jax.types import Task
 
 UNBOUNDED = 1e6  # limits of an observation beyond this are none
 AROUND = 100  # random points

@@ -10,8 +10,8 @@ import numpy as np
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math.circles import to_observation
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import user_code
-from pegasus_jax.types import Task
 
 
 def of_config(config: Config, task: Task) -> Callable[[Any], Any] | None:

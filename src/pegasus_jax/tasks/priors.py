@@ -10,14 +10,15 @@ from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math import circles
 from pegasus_jax.models.residual import Simulate
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import user_code
-from pegasus_jax.types import Array, Task
+from pegasus_jax.types import Array
 
 FILE = ".xml"
 
 
 def of_config(config: Config, task: Task) -> Simulate | None:
-    """The config's prior, or None. Raises ConfigError, in one line, for one that there is not or that does not suit the task."""
+    """The config's prior, or None. Raises ConfigError, in one line, for one that does not suit the task."""
     if config.prior is None:
         return None
     what = f"prior={shown(config.prior)}"

@@ -9,7 +9,8 @@ import numpy as np
 from pegasus_jax.config import Config
 from pegasus_jax.math.angles import difference, encode
 from pegasus_jax.memory import combined, past_controls, resting
-from pegasus_jax.types import Array, Hindsight, Memory, Task
+from pegasus_jax.task import Task
+from pegasus_jax.types import Array, Hindsight, Memory
 
 WINDOW, ORDER = 5, 3  # rows of the local polynomial that tells rates afterwards, and its degree
 

@@ -13,8 +13,9 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Sensors
 from pegasus_jax.math.circles import Circles, to_observation, to_state
 from pegasus_jax.memory import resting
+from pegasus_jax.task import Task
 from pegasus_jax.tasks.terms import alone
-from pegasus_jax.types import Cost, Task
+from pegasus_jax.types import Cost
 
 
 def sensed(task: Task, sensors: Sensors) -> Task:

@@ -10,8 +10,9 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
+from pegasus_jax.task import Signal, Task
 from pegasus_jax.tasks import user_code
-from pegasus_jax.types import Array, Key, Signal, Task
+from pegasus_jax.types import Array, Key
 
 FILES = (".csv", ".npz")  # of references
 AHEAD = (0, 1, 3)  # control periods from now, of which the policy sees the reference

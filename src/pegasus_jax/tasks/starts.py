@@ -5,8 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import circled
-from pegasus_jax.types import Array, Key, Task
+from pegasus_jax.types import Array, Key
 
 
 def start(key: Key, *, task: Task) -> Array:

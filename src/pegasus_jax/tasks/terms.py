@@ -15,9 +15,10 @@ import numpy as np
 from pegasus_jax import memory as recall
 from pegasus_jax.checks import ConfigError, did_you_mean, shown
 from pegasus_jax.imagine.costs import blind_to_memory
+from pegasus_jax.task import Task
 from pegasus_jax.tasks import user_code
 from pegasus_jax.tasks.signals import AHEAD, draws
-from pegasus_jax.types import Array, Cost, Memory, Task
+from pegasus_jax.types import Array, Cost, Memory
 
 TERMS = ("u", "previous_u", "t", "reference", "goal")
 CLOCK = "t [s]"

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from pegasus_jax.checks import RunError
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.store import load_episode, load_imagined, trials
-from pegasus_jax.types import Task
+from pegasus_jax.task import Task
 
 REAL, IMAGINED = "#d1495b", "#30638e"
 

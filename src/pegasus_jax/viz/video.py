@@ -24,7 +24,8 @@ from pegasus_jax.checks import RunError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import restore
 from pegasus_jax.runs.collect import failed
-from pegasus_jax.types import Array, Key, Params, Policy, Task, Trajectory
+from pegasus_jax.task import Task
+from pegasus_jax.types import Array, Key, Params, Policy, Trajectory
 
 WIDTH, HEIGHT, STRIP = 640, 480, 192  # [pixels], multiples of the 16 of a video's blocks
 COST, CURSOR = "#d1495b", np.array([40, 40, 40], np.uint8)

@@ -1,0 +1,59 @@
+"""What is to be learned: a plant, a cost, where episodes start, and what is asked of a policy from outside."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from pegasus_jax.types import NO_MEMORY, Array, Cost, Hindsight, Memory
+
+
+class Signal(NamedTuple):
+    """What is asked of a policy from outside: a reference, which changes with time, or the goal of an episode."""
+
+    value: Callable[[Array], Array]  # a reference: t [] [s] -> [R]; a goal: key -> [G]
+    units: tuple[float, ...]  # how large each of its entries is: a network counts it in these
+
+
+class Task(NamedTuple):
+    """What is to be learned: a plant's interface, a cost, and where episodes start."""
+
+    name: str
+    plant: Any  # reset(key) -> state; step(state, u [U]) -> state; observe(state) -> x [D]. None: others give episodes
+    cost: Cost
+    angles: tuple[int, ...]  # the dimensions of x that are angles [rad]
+    start_mean: Any  # [D]
+    start_std: Any  # [D]
+    sensor_std: Any  # [D] noise added to what the policy and the data see
+    control_low: Any  # [U]
+    control_high: Any  # [U]
+    horizon: int  # H, control periods an episode
+    dt: float  # [s] control period
+    state_names: tuple[str, ...]
+    control_names: tuple[str, ...]
+    # The entries of x that are rates of its other entries, in the order of those; (): x is not made of such pairs.
+    rates: tuple[int, ...] = ()
+    success: float = 0.2  # a rollout whose last five steps cost less than this on average has succeeded
+    # reset(seed) -> x [D]; step(u [U]) -> (x [D], the control sent [U], how it ended or ""); close(). A plant outside
+    # of JAX, of which there is one: a Gymnasium environment, maybe a robot.
+    environment: Any = None
+    # x [D] -> probability that an episode ends there; None: it ends at the horizon, or where the environment says so
+    stop: Callable[[Array], Array] | None = None
+    stop_cost: float = 1.0  # of each control period that an early end leaves out
+    # Pairs of entries of the user's observation that are cosine and sine of one angle of x (math/circles.py); (): the
+    # observation is x.
+    circles: tuple[tuple[int, ...], ...] = ()
+    prior: Callable[[Array, Array], Array] | None = None  # a simulator: (x [D], u [U]) -> x [D] one period later
+    starts: Any = None  # [N, D] states where episodes start, equally likely; None: N(start_mean, diag(start_std^2))
+    starts_std: Any = None  # [D] spread of the starts around these, normal; None: they are used as they are
+    memory: Memory = NO_MEMORY
+    hindsight: Hindsight | None = None  # None: the states are as observed
+    # Which of u, previous_u, t, reference, goal the cost takes; None: `cost` and `stop` are of x yet, not of x'
+    terms: tuple[str, ...] | None = None
+    reference: Signal | None = None
+    goal: Signal | None = None
+    constraint: Any = None  # an `imagine.limits.Constraint`; None: a policy may do anything
+    guide: Callable[[Any], Any] | None = None  # x [D] -> u [U], the controller of the first episodes; None: random
+
+    @property
+    def may_end(self) -> bool:
+        """Whether an episode may be shorter than the horizon."""
+        return self.environment is not None or self.stop is not None
