@@ -30,14 +30,14 @@ configs = st.builds(
         dropout=st.sampled_from(config_models.DROPOUTS),
         heteroscedastic=st.booleans(),
         weight_decay=st.floats(0, 10),
-        initializer=st.sampled_from(config.INITIALIZERS),
+        initializer=st.sampled_from(config_models.INITIALIZERS),
     ),
     policy=st.builds(
         MLP,
         hidden=layers,
         dropout=st.floats(0, 0.99),
         squash=st.sampled_from(config_policies.SQUASHES),
-        initializer=st.sampled_from(config.INITIALIZERS),
+        initializer=st.sampled_from(config_models.INITIALIZERS),
     ),
     fit=st.builds(Fit, steps=whole(1), batch_size=whole(1), learning_rate=positive),
     search=st.builds(

@@ -5,7 +5,9 @@ from typing import Any, cast
 
 import pytest
 
+from pegasus_jax.config import Config
 from pegasus_jax.runs import train, writers
+from pegasus_jax.runs.logged import NONE
 from pegasus_jax.runs.stuck import stuck
 
 FIRST: dict[str, Any] = {
@@ -45,9 +47,8 @@ def test_a_run_says_it_once_for_each_two_trials(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(train, "one_trial", lambda job, states, trial: (states, [next(rows)]))
     monkeypatch.setattr(train, "summary", lambda rows, trials: f"trial {rows[0]['trial']}")
     said: list[str] = []
-    job = SimpleNamespace(
-        writer=writers.nothing(1), config=SimpleNamespace(trials=4), display=SimpleNamespace(line=said.append)
-    )
+    display = SimpleNamespace(line=said.append)
+    job = SimpleNamespace(writer=writers.nothing(1), config=Config(trials=4), display=display, logs=NONE)
     train.learn(cast(Any, job), cast(Any, None))
     assert [line[:40] for line in said] == [
         "trial 1",
