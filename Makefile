@@ -32,7 +32,7 @@ test: $(STAMP) ## run the quick tests on JOBS=2 cores, within 8 minutes; some of
 test-slow: $(STAMP) ## run the tests that make test leaves out: whole runs, kills, the pages of docs/, short campaigns
 	$(PYTEST) -m "slow and not campaign" $(ARGS)
 
-campaigns: $(STAMP) ## run the long campaigns of kills, damages, bad commands and stops: an hour or more
+campaigns: $(STAMP) ## run the long campaigns of kills, damages, bad commands and stops, and what repeats slow tests: an hour or more
 	$(BIN)/python -m pytest -m campaign $(ARGS)
 
 check: $(STAMP) ## formatting, lint, types, layers: everything that needs no training

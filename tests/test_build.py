@@ -191,7 +191,7 @@ def small_pilco(model, policy, task, **search):
     ("model", "policy", "task"),
     [
         ("gp", config.Linear(), cart),
-        ("ssgp", config.RBF(num_centers=4), dial),
+        pytest.param("ssgp", config.RBF(num_centers=4), dial, marks=pytest.mark.campaign),
     ],
     ids=["gp-linear", "ssgp-rbf"],
 )

@@ -48,9 +48,10 @@ PAPER = [("log_normal", "dropout_mlp"), ("binary", "mlp"), ("binary", "rbf"), ("
 FAMILY = [*TURNS, *((*pair, "matched") for pair in PAPER), *MOMENTS]
 # Of make test: each model once, each policy and each way at least twice.
 QUICK = [TURNS[len(PIECES) * i + (i + i // 2) % len(PIECES)] for i in range(len(MODELS))]
-MEMBERS = [
-    pytest.param(*member, id="-".join(member), marks=() if member in QUICK else pytest.mark.slow) for member in FAMILY
-]
+MARKS = dict.fromkeys(QUICK, ()) | {
+    ("ssgp", "rbf", "analytic"): pytest.mark.campaign
+}  # it takes three quarters of a minute
+MEMBERS = [pytest.param(*member, id="-".join(member), marks=MARKS.get(member, pytest.mark.slow)) for member in FAMILY]
 
 
 def composed(model, policy, how):

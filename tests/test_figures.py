@@ -204,7 +204,7 @@ def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
     assert (out / "mine.png").read_bytes().startswith(b"\x89PNG")
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_cores_of_a_processor_share_the_seeds_of_a_study(tmp_path):
     """The command makes a device of each of two cores; here there is one. The numbers are those of one program."""
     figure = figure_of(tmp_path, TINY)

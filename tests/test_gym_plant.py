@@ -43,7 +43,7 @@ def train(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     ("env", "cost", "states", "limit"),
     [
         ("Pendulum-v1", "costs:upright", 3, 2.0),
-        pytest.param("InvertedDoublePendulum-v5", "costs:balanced", 9, 1.0, marks=pytest.mark.slow),
+        pytest.param("InvertedDoublePendulum-v5", "costs:balanced", 9, 1.0, marks=pytest.mark.campaign),
     ],
 )
 def test_an_environment_not_written_for_us(env: str, cost: str, states: int, limit: float, tmp_path: Path) -> None:

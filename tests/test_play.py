@@ -71,7 +71,7 @@ def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
     assert drawn.std() > 0  # something is to be seen
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_film_replaces_a_link_and_what_it_leads_to_stays(run: Path, tmp_path: Path) -> None:
     """Neither where the film goes nor where it is written is a file that was there opened."""
     kept = tmp_path / "kept"

@@ -176,7 +176,7 @@ def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_
     alike(study, folder)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_processes_that_act_as_one_machine_change_nothing(study: Path, tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("localhost", 0))

@@ -42,13 +42,13 @@ CARTPOLE = (
 KEPT = ("trial", "plant_seconds", "policy", "episode_cost", "mean_cost", "success_rate", "calibration", "seconds")
 
 
-def cartpole(options: dict[str, str], words: Sequence[str], told: dict[str, Any]) -> None:
+def cartpole(options: dict[str, str], words: Sequence[str], command: str) -> None:
     """Every seed in one program; its curves are written after each trial."""
     config = config_io.parse(dict(word.split("=", 1) for word in [*CARTPOLE, *words]))
     seeds, out = seed_list(options.get("seeds", "100-109")), Path(options["out"])
     share_cpus(len(seeds))
     result = study(config, seeds, out)
-    write(out, result | {"about": told})
+    write(out, result | {"about": about(command)})
     print(table(result), flush=True)
 
 
@@ -74,7 +74,7 @@ def rows(run: Path) -> list[dict[str, Any]]:
     return [{name: row[name] for name in KEPT if name in row} for row in found]
 
 
-def furuta(options: dict[str, str], words: Sequence[str], told: dict[str, Any]) -> None:
+def furuta(options: dict[str, str], words: Sequence[str], command: str) -> None:
     """A process a seed, `jobs` at a time with a core each. Raises ConfigError where there is no robot."""
     folder, out = Path(options.get("furuta", ".")).absolute(), Path(options["out"]).absolute()
     if not (folder / "robot.py").is_file():
@@ -86,7 +86,7 @@ def furuta(options: dict[str, str], words: Sequence[str], told: dict[str, Any]) 
     for job in range(jobs):
         cores.put(own[job % len(own)] if own else None)
     (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
-    runs: list[dict[str, Any]] = []
+    runs, told = list[dict[str, Any]](), about(command)
     given = [*FURUTA, *words, f"env_args.delay={options.get('delay', '1')}"]
     with ThreadPoolExecutor(jobs) as pool:
         seeds, trials = seed_list(options.get("seeds", "100-109")), options.get("trials", "13")
@@ -124,7 +124,7 @@ def main(given: list[str]) -> None:
     if kind == "cartpole":
         words.append(f"trials={options.get('trials', '10')}")
     Path(options["out"]).parent.mkdir(parents=True, exist_ok=True)
-    KINDS[kind](options, words, about(shlex.join(["python", "-m", "benchmarks.robot.sensors", *given])))
+    KINDS[kind](options, words, shlex.join(["python", "-m", "benchmarks.robot.sensors", *given]))
 
 
 if __name__ == "__main__":

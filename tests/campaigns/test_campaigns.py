@@ -18,7 +18,7 @@ from tests.campaigns.command_kinds import Command
 from tests.campaigns.common import ROOT, Outcome
 from tests.campaigns.damage_kinds import DAMAGES, Damage, gone
 
-SHORT = {"kills": 4, "damages": 3, "commands": 12, "stops": 3}
+SHORT = {"kills": 2, "damages": 2, "commands": 12, "stops": 2}
 LONG = {"kills": 1000, "damages": 200, "commands": 400, "stops": 100}
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked, and watched through /proc")
 

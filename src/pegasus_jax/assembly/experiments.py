@@ -57,7 +57,8 @@ def compose(
     With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
     does not suit the config: a cost without a width, for example, needs `search.cost_width_start=1`.
     """
-    task = tasks.whole(remembering(config, task), None if cost is None else as_cost(cost))
+    task = remembering(config, task._replace(cost=as_cost(task.cost)))
+    task = tasks.whole(task, None if cost is None else as_cost(cost))
     dynamics = dynamics or dynamics_of(config.model, task)
     fitter = fitter or fit_of(config.fit, dynamics)
     if task.prior is not None:  # then all of that is of what the simulator gets wrong

@@ -1,25 +1,23 @@
 """Task names -> tasks. The only importer of pegasus_envs, and with it of MuJoCo and Gymnasium, once a task is made."""
 
 import dataclasses
-import inspect
-import math
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pegasus_jax import interrupt, memory
-from pegasus_jax.checks import ConfigError, check_range, did_you_mean
-from pegasus_jax.config import GYM, MANEUVERS, MJCF, Config
+from pegasus_jax.checks import ConfigError, did_you_mean
+from pegasus_jax.config import GYM, MJCF, Config
 from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.math import circles
 from pegasus_jax.task import Task
 from pegasus_jax.tasks import circled, constrained, guide, priors, sensed, terms, user_code
+from pegasus_jax.tasks.own_plants import TASKS
 from pegasus_jax.tasks.signals import FILES, named, with_signals
 from pegasus_jax.tasks.starts import from_starts
 from pegasus_jax.tasks.terms import whole as whole
@@ -49,46 +47,6 @@ def of_plant(name: str, plant: "Plant") -> Task:
         control_names=plant.control_names,
         rates=plant.rates,
     )
-
-
-def _cartpole(_: Any, arguments: Sequence[str]) -> "Plant":
-    from pegasus_envs.cartpole import cartpole
-
-    return cartpole(**_constants(arguments, cartpole))
-
-
-def _double_cartpole(_: Any, arguments: Sequence[str]) -> "Plant":
-    from pegasus_envs.double_cartpole import double_cartpole
-
-    return double_cartpole(**_constants(arguments, double_cartpole))
-
-
-def _constants(arguments: Sequence[str], plant: Callable[..., "Plant"]) -> dict[str, float]:
-    """The physical constants of env_args.NAME=VALUE. Raises ConfigError for a name or a number that cannot be."""
-    found = {}
-    for name, _, value in (argument.partition("=") for argument in arguments):
-        if name not in (names := [*inspect.signature(plant).parameters]):
-            raise ConfigError(f"env_args.{name} is no constant of the plant; {did_you_mean(name, names)}")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            raise ConfigError(f"env_args.{name}={value} is not a number; for example env_args.{name}=0.4") from None
-        check_range(f"env_args.{name}", found[name], 0, math.inf, open_high=True)
-    return found
-
-
-def _swimmer(maneuver: Any, legs: Any, _: Sequence[str]) -> "Plant":
-    from pegasus_envs.swimmer.plant import swimmer
-
-    return swimmer(maneuver, legs)
-
-
-# Name -> the plant, given how many of its legs a swimmer drives, and constants of a cart-pole, as NAME=VALUE.
-TASKS: dict[str, Callable[[Any, Sequence[str]], "Plant"]] = {
-    "cartpole": _cartpole,
-    "double_cartpole": _double_cartpole,
-    **{f"swimmer_{maneuver}": partial(_swimmer, maneuver) for maneuver in MANEUVERS},
-}
 
 
 def make(name: str, legs: int = 2, constants: Sequence[str] = ()) -> Task:
