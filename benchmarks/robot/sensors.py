@@ -10,22 +10,15 @@ Every trial is written when it is there. Furuta runs that were stopped after `mi
 Tuning seeds are 100 to 119.
 """
 
-import json
-import os
 import shlex
 import sys
-import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
-from benchmarks.plants_suite.__main__ import ONE_CORE, on_core
+from benchmarks.robot import seeds
 from pegasus_jax.checks import ConfigError, choice
-from pegasus_jax.cli.sweep import PROGRAM
 from pegasus_jax.runs import config_io
-from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import share_cpus
 from pegasus_jax.runs.study import SOLVED, first_solved, seed_list, study, table, write
@@ -39,65 +32,27 @@ CARTPOLE = (
     *("task=cartpole", "sensors.measured=[0,3]", "sensors.velocity=difference"),
     "search.observation_noise=plant",  # what the model predicts is twice the sensors' noise
 )
-KEPT = ("trial", "plant_seconds", "policy", "episode_cost", "mean_cost", "success_rate", "calibration", "seconds")
 
 
 def cartpole(options: dict[str, str], words: Sequence[str], command: str) -> None:
     """Every seed in one program; its curves are written after each trial."""
     config = config_io.parse(dict(word.split("=", 1) for word in [*CARTPOLE, *words]))
-    seeds, out = seed_list(options.get("seeds", "100-109")), Path(options["out"])
-    share_cpus(len(seeds))
-    result = study(config, seeds, out)
+    numbers, out = seed_list(options.get("seeds", "100-109")), Path(options["out"])
+    share_cpus(len(numbers))
+    result = study(config, numbers, out)
     write(out, result | {"about": about(command)})
     print(table(result), flush=True)
 
 
-def one(run: Path, words: Sequence[str], seed: int, trials: str, until: float, cores: Any) -> dict[str, Any]:
-    """One run, begun or gone on with until a time, and its trials; `error` is the last line of a failure."""
-    core = cores.get()
-    try:
-        if (left := until - time.monotonic()) < 10:
-            return {"seed": seed, "error": "not begun", "trials": rows(run)}
-        begun = (run / "config.yaml").exists()
-        task = [f"resume={run}"] if begun else [*words, f"seed={seed}", f"out={run}"]
-        error = on_core([*PROGRAM, *task, f"trials={trials}"], core, left)[1]
-    finally:
-        cores.put(core)
-    print(f"seed {seed}: success {[row['success_rate'] for row in rows(run)]} {error or ''}", flush=True)
-    return {"seed": seed, "error": error, "trials": rows(run)}
-
-
-def rows(run: Path) -> list[dict[str, Any]]:
-    """What is kept of the trials of a run."""
-    path = run / "trials.jsonl"
-    found = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
-    return [{name: row[name] for name in KEPT if name in row} for row in found]
-
-
 def furuta(options: dict[str, str], words: Sequence[str], command: str) -> None:
     """A process a seed, `jobs` at a time with a core each. Raises ConfigError where there is no robot."""
-    folder, out = Path(options.get("furuta", ".")).absolute(), Path(options["out"]).absolute()
-    if not (folder / "robot.py").is_file():
-        raise ConfigError(f"furuta={folder} has no robot.py")
-    ONE_CORE["PYTHONPATH"] += os.pathsep + str(folder)
-    until = time.monotonic() + 60 * float(options.get("minutes", "9"))
-    own = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    jobs, cores = int(options.get("jobs", "2")), SimpleQueue[int | None]()
-    for job in range(jobs):
-        cores.put(own[job % len(own)] if own else None)
-    (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
-    runs, told = list[dict[str, Any]](), about(command)
+    seeds.robot(options)
+    options.setdefault("trials", "13")
     given = [*FURUTA, *words, f"env_args.delay={options.get('delay', '1')}"]
-    with ThreadPoolExecutor(jobs) as pool:
-        seeds, trials = seed_list(options.get("seeds", "100-109")), options.get("trials", "13")
-        waiting = [pool.submit(one, home / f"seed{s}", given, s, trials, until, cores) for s in seeds]
-        for job in as_completed(waiting):
-            runs.append(job.result())
-            write_json(out, {"runs": runs, "words": given, "about": told})
-    print(learned(runs))
+    print(table_of(seeds.learned(options, given, command)))
 
 
-def learned(runs: Sequence[dict[str, Any]]) -> str:
+def table_of(runs: Sequence[dict[str, Any]]) -> str:
     """A line a seed: after how much of the robot's time 9 of 10 episodes succeed, then success trial by trial."""
     lines = []
     for run in sorted(runs, key=lambda run: run["seed"]):
@@ -117,7 +72,7 @@ def main(given: list[str]) -> None:
     """The command line of this module. Raises ConfigError for what it cannot use."""
     kind, *rest = given or [""]
     choice("the first word", kind, KINDS)
-    options, dotted = config_io.split(rest, ("furuta", "delay", "seeds", "jobs", "out", "minutes", "trials"))
+    options, dotted = config_io.split(rest, ("delay", *seeds.OPTIONS))
     options.setdefault("out", f"runs/sensors-{kind}.json")
     delay = options.get("delay", {"cartpole": "0", "furuta": "1"}[kind])
     words = [f"sensors.delay={delay}", *(f"{key}={value}" for key, value in dotted.items())]

@@ -1,0 +1,77 @@
+"""A command of pegasus-train for several seeds, a process each with a core of its own, on a robot of a folder.
+
+The runs are in OUT without .json: the same command goes on with those that were stopped, by hand or after `minutes`.
+"""
+
+import json
+import os
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+from benchmarks.plants_suite.__main__ import ONE_CORE, on_core
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.cli.sweep import PROGRAM
+from pegasus_jax.runs.files import write_json
+from pegasus_jax.runs.machine import about
+from pegasus_jax.runs.study import seed_list
+
+OPTIONS = ("furuta", "seeds", "jobs", "out", "minutes", "trials")
+KEPT = (
+    *("trial", "plant_seconds", "log_seconds", "policy", "episode_cost", "mean_cost", "success_rate", "calibration"),
+    "seconds",
+)
+
+
+def robot(options: dict[str, str]) -> Path:
+    """The folder of robot.py, from which every run imports. Raises ConfigError where there is none."""
+    folder = Path(options.get("furuta", ".")).absolute()
+    if not (folder / "robot.py").is_file():
+        raise ConfigError(f"furuta={folder} has no robot.py")
+    ONE_CORE["PYTHONPATH"] += os.pathsep + str(folder)
+    return folder
+
+
+def learned(options: dict[str, str], words: Sequence[str], command: str) -> list[dict[str, Any]]:
+    """The runs of all seeds with what is kept of their trials, written to `out` after each of them."""
+    until = time.monotonic() + 60 * float(options.get("minutes", "9"))
+    out, told = Path(options["out"]).absolute(), about(command)
+    own = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    jobs, cores = int(options.get("jobs", "2")), SimpleQueue[int | None]()
+    for job in range(jobs):
+        cores.put(own[job % len(own)] if own else None)
+    (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
+    runs: list[dict[str, Any]] = []
+    words = [*words, f"trials={options['trials']}"]
+    with ThreadPoolExecutor(jobs) as pool:
+        seeds = seed_list(options.get("seeds", "100-109"))
+        for job in as_completed([pool.submit(one, home / f"seed{s}", words, s, until, cores) for s in seeds]):
+            runs = sorted([*runs, job.result()], key=lambda run: run["seed"])
+            write_json(out, {"runs": runs, "words": words, "about": told})
+    return runs
+
+
+def one(run: Path, words: Sequence[str], seed: int, until: float, cores: Any) -> dict[str, Any]:
+    """One run, begun or gone on with until a time, and its trials; `error` is the last line of a failure."""
+    core = cores.get()
+    try:
+        if (left := until - time.monotonic()) < 10:
+            return {"seed": seed, "error": "not begun", "trials": rows(run)}
+        task = (
+            [f"resume={run}", words[-1]] if (run / "config.yaml").exists() else [*words, f"seed={seed}", f"out={run}"]
+        )
+        error = on_core([*PROGRAM, *task], core, left)[1]
+    finally:
+        cores.put(core)
+    print(f"seed {seed}: success {[row['success_rate'] for row in rows(run)]} {error or ''}", flush=True)
+    return {"seed": seed, "error": error, "trials": rows(run)}
+
+
+def rows(run: Path) -> list[dict[str, Any]]:
+    """What is kept of the trials of a run."""
+    path = run / "trials.jsonl"
+    found = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+    return [{name: row[name] for name in KEPT if name in row} for row in found]
