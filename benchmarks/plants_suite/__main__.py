@@ -56,6 +56,15 @@ def one(name: str, seed: int, home: Path, words: Sequence[str], minutes: float, 
     return {"plant": name, "seed": seed, "seconds": seconds, "error": error, "trials": rows}
 
 
+def core_queue(jobs: int) -> SimpleQueue[int | None]:
+    """A core for each of so many jobs at a time, to be taken and put back; None where a process cannot be pinned."""
+    own = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    cores: SimpleQueue[int | None] = SimpleQueue()
+    for job in range(jobs):
+        cores.put(own[job % len(own)] if own else None)
+    return cores
+
+
 def on_core(command: list[str], core: int | None, limit: float | None) -> tuple[str, str | None]:
     """What a command printed, and the last line of its error or None; it is interrupted after `limit` seconds."""
     pin = ["taskset", "-c", str(core)] if core is not None and shutil.which("taskset") else []
@@ -97,10 +106,7 @@ def main(given: list[str]) -> None:
         raise ConfigError(f"plants={wrong[0]} is unknown; {did_you_mean(wrong[0], PLANTS)}")
     out = Path(options.get("out", "runs/plants_suite.json")).absolute()
     jobs, minutes = int(options.get("jobs", "2")), float(options.get("minutes", "60"))
-    own = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    cores: SimpleQueue[int | None] = SimpleQueue()
-    for job in range(jobs):
-        cores.put(own[job % len(own)] if own else None)
+    cores = core_queue(jobs)
     told = about(shlex.join(["python", "-m", "benchmarks.plants_suite", *given]))
     (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
     words, runs = [f"{key}={value}" for key, value in rest.items()], list[dict[str, Any]]()

@@ -56,8 +56,3 @@ def cartpole(x: Array) -> Array:
 def dm_cartpole(x: Array) -> Array:
     """[cart, angle, speed, rate], upright at 0: the tip of a pole of 1 m over the middle of the rail."""
     return saturating((x[0] + jnp.sin(x[1])) / 0.4, (jnp.cos(x[1]) - 1) / 0.4)
-
-
-def dm_pendulum(x: Array) -> Array:
-    """[angle, rate], upright at 0."""
-    return saturating((jnp.cos(x[0]) - 1) / 0.5, jnp.sin(x[0]) / 0.5)

@@ -33,7 +33,7 @@ class DmControl(gymnasium.Env):
         return np.concatenate([data.qpos, data.qvel]).astype(np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[np.ndarray, dict]:
-        """Start as the suite does. A seed begins its random numbers anew."""
+        """Start as the suite does. A seed is that of its random numbers."""
         super().reset(seed=seed)
         if seed is not None:
             self.env = suite.load(self.domain, self.task, task_kwargs={"random": seed})

@@ -28,7 +28,9 @@ PLANTS: dict[str, Plant] = {
     IDP: Plant(IDP, task(40, "double_pendulum", "double_pendulum_falls"), 30, 8500.0, 60.0),
     "Reacher-v5": Plant("Reacher-v5", task(50, "reacher"), 60, -6.0, 60.0),
     "dm_cartpole": Plant(f"{DM}CartPole-v0", task(25, "dm_cartpole", angles="[1]"), 12, 850.0, 25.0),
-    "dm_pendulum": Plant(f"{DM}Pendulum-v0", task(80, "dm_pendulum", angles="[0]"), 8, 800.0, 40.0),
+    "dm_pendulum": Plant(
+        f"{DM}Pendulum-v0", task(80, "pendulum", angles="[0]", module="costs_of_joints"), 8, 800.0, 40.0
+    ),
     # Its return is minus the sum of the cost: a swing-up that holds has some -11, a slow one that never holds -16.
     "CartPole": Plant("pegasus_envs:pegasus/CartPoleSwingUp-v0", task(25, "cartpole", angles="[3]"), 15, -12.5, 20.0),
 }

@@ -15,13 +15,12 @@ import shlex
 import sys
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.plants_suite.__main__ import ONE_CORE, on_core
+from benchmarks.plants_suite.__main__ import ONE_CORE, core_queue, on_core
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import PROGRAM
 from pegasus_jax.runs import checkpoint, config_io, store
@@ -137,10 +136,7 @@ def main(given: list[str]) -> None:
     ONE_CORE["PYTHONPATH"] = os.pathsep.join([options["furuta"], ONE_CORE["PYTHONPATH"]])
     seeds, jobs = seed_list(options.get("seeds", "100-109")), int(options.get("jobs", "2"))
     out, minutes = Path(options.get("out", "runs/limits.json")).absolute(), float(options.get("minutes", "9"))
-    own = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    cores: SimpleQueue[int | None] = SimpleQueue()
-    for job in range(jobs):
-        cores.put(own[job % len(own)] if own else None)
+    cores = core_queue(jobs)
     told = about(shlex.join(["python", "-m", "benchmarks.robot.limits", *given]))
     (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
     words, runs = [f"{key}={value}" for key, value in rest.items()], list[dict[str, Any]]()

@@ -11,35 +11,15 @@ the same command goes on with runs that were stopped after `minutes`. Tuning see
 
 import shlex
 import sys
-from collections.abc import Sequence
-from typing import Any
 
 from benchmarks.robot import seeds
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.runs import config_io
-from pegasus_jax.runs.study import SOLVED, first_solved
 
 TASK = (
     *("task=gym", "env=robot:FurutaSafe-v0", "cost=robot:cost", "angles=[1]", "horizon=100", "eval_episodes=10"),
     *("start_mean=[0,0,0,0,0]", "start_std=[0.02,0.02,0.01,0.01,0.01]"),
 )
-
-
-def table(runs: Sequence[dict[str, Any]]) -> str:
-    """A line a seed: the first trial of 90 %, and success trial by trial; trial 1 has no own episode before it."""
-    lines = []
-    for run in sorted(runs, key=lambda run: run["seed"]):
-        success = [row["success_rate"] for row in run["trials"]]
-        first = first_solved(success)
-        seconds = f"{run['trials'][first - 1]['plant_seconds']:g} s" if first else "-"
-        rates = " ".join(f"{rate:4.0%}" for rate in success)
-        lines.append(
-            f"seed {run['seed']}  first >= {SOLVED:.0%}: trial {first or '-'}, after {seconds} of robot   {rates}"
-        )
-    last = [run["trials"][-1]["success_rate"] >= SOLVED for run in runs if run["trials"]]
-    ever = [any(row["success_rate"] >= SOLVED for row in run["trials"]) for run in runs]
-    lines.append(f"{sum(ever)} of {len(runs)} seeds reached {SOLVED:.0%}, {sum(last)} are there after their last trial")
-    return "\n".join(lines)
 
 
 def main(given: list[str]) -> None:
@@ -49,7 +29,7 @@ def main(given: list[str]) -> None:
     logs = ["explore.trials=1"] if random else [f"data={folder}/logs/*.csv", "explore.trials=0"]
     words = [*TASK, *logs, *(f"{key}={value}" for key, value in rest.items())]
     options = {"out": "runs/logs.json", "trials": "10"} | options
-    print(table(seeds.learned(options, words, shlex.join(["python", "-m", "benchmarks.robot.logs", *given]))))
+    print(seeds.table(seeds.learned(options, words, shlex.join(["python", "-m", "benchmarks.robot.logs", *given]))))
 
 
 if __name__ == "__main__":

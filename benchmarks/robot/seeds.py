@@ -9,15 +9,14 @@ import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
-from queue import SimpleQueue
 from typing import Any
 
-from benchmarks.plants_suite.__main__ import ONE_CORE, on_core
+from benchmarks.plants_suite.__main__ import ONE_CORE, core_queue, on_core
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import PROGRAM
 from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about
-from pegasus_jax.runs.study import seed_list
+from pegasus_jax.runs.study import SOLVED, first_solved, seed_list
 
 OPTIONS = ("furuta", "seeds", "jobs", "out", "minutes", "trials")
 KEPT = (
@@ -39,10 +38,7 @@ def learned(options: dict[str, str], words: Sequence[str], command: str) -> list
     """The runs of all seeds with what is kept of their trials, written to `out` after each of them."""
     until = time.monotonic() + 60 * float(options.get("minutes", "9"))
     out, told = Path(options["out"]).absolute(), about(command)
-    own = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    jobs, cores = int(options.get("jobs", "2")), SimpleQueue[int | None]()
-    for job in range(jobs):
-        cores.put(own[job % len(own)] if own else None)
+    cores = core_queue(jobs := int(options.get("jobs", "2")))
     (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
     runs: list[dict[str, Any]] = []
     words = [*words, f"trials={options['trials']}"]
@@ -75,3 +71,20 @@ def rows(run: Path) -> list[dict[str, Any]]:
     path = run / "trials.jsonl"
     found = [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
     return [{name: row[name] for name in KEPT if name in row} for row in found]
+
+
+def table(runs: Sequence[dict[str, Any]]) -> str:
+    """A line a seed: the first trial of 90 % and the robot's time by then, then success trial by trial."""
+    lines, rates = [], [[row["success_rate"] for row in run["trials"]] for run in runs]
+    for run, success in zip(runs, rates, strict=True):
+        first = first_solved(success)
+        seconds = f"{run['trials'][first - 1]['plant_seconds']:g} s" if first else "-"
+        shown = " ".join(f"{rate:4.0%}" for rate in success)
+        lines.append(
+            f"seed {run['seed']}  first >= {SOLVED:.0%}: trial {first or '-'}, after {seconds} of robot   {shown}"
+        )
+    ever = sum(first_solved(success) is not None for success in rates)
+    last = sum(bool(success) and success[-1] >= SOLVED for success in rates)
+    return "\n".join(
+        [*lines, f"{ever} of {len(runs)} seeds reached {SOLVED:.0%}, {last} are there after their last trial"]
+    )

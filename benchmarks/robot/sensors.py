@@ -14,14 +14,13 @@ import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 from benchmarks.robot import seeds
 from pegasus_jax.checks import ConfigError, choice
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import share_cpus
-from pegasus_jax.runs.study import SOLVED, first_solved, seed_list, study, table, write
+from pegasus_jax.runs.study import seed_list, study, table, write
 
 FURUTA = (
     *("task=gym", "env=benchmarks.robot.encoders:TwoEncoders-v0", "cost=robot:cost", "angles=[1]", "horizon=100"),
@@ -49,20 +48,7 @@ def furuta(options: dict[str, str], words: Sequence[str], command: str) -> None:
     seeds.robot(options)
     options.setdefault("trials", "13")
     given = [*FURUTA, *words, f"env_args.delay={options.get('delay', '1')}"]
-    print(table_of(seeds.learned(options, given, command)))
-
-
-def table_of(runs: Sequence[dict[str, Any]]) -> str:
-    """A line a seed: after how much of the robot's time 9 of 10 episodes succeed, then success trial by trial."""
-    lines = []
-    for run in sorted(runs, key=lambda run: run["seed"]):
-        success = [row["success_rate"] for row in run["trials"]]
-        first = first_solved(success)
-        seconds = f"{run['trials'][first - 1]['plant_seconds']:g} s" if first else "-"
-        rates = " ".join(f"{rate:4.0%}" for rate in success)
-        lines.append(f"seed {run['seed']}  first >= {SOLVED:.0%} after {seconds:>6} of robot   {rates}")
-    ever = sum(first_solved([row["success_rate"] for row in run["trials"]]) is not None for run in runs)
-    return "\n".join([*lines, f"{ever} of {len(runs)} seeds reached {SOLVED:.0%}"])
+    print(seeds.table(seeds.learned(options, given, command)))
 
 
 KINDS = {"cartpole": cartpole, "furuta": furuta}

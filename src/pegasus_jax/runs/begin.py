@@ -112,7 +112,7 @@ def begun(states: RunState, config: Config, run: Path | None = None) -> RunState
 def taken_over(states: RunState, old: RunState, parts: tuple[str, ...]) -> RunState:
     """States [S, ...] with the parameters of the parts of another state, of one run or [S, ...], in their precision.
 
-    Optimizers begin anew: their moments are those of another cost or of other data.
+    Optimizers start fresh: their moments are those of another cost or of other data.
     """
 
     def part(name: str) -> TrainState:

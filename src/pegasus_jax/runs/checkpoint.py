@@ -72,7 +72,7 @@ def restore(run: Path, trial: int, like: RunState) -> RunState:
         except Exception as error:  # orbax raises many kinds for what it cannot read
             raise RunError(f"{folder} is of another version: orbax cannot read it as ours") from error
     stored |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in _named(like).items() if not leaf.size}
-    stored.setdefault("succeeded", np.zeros((), bool))  # what runs before 0.2 did not keep
+    stored.setdefault("succeeded", np.zeros((), bool))  # older runs did not keep it
     optimizers = {"model": like.model.optimizer, "policy": like.policy.optimizer}
     rest = like._replace(model=like.model._replace(optimizer=None), policy=like.policy._replace(optimizer=None))
     if difference := _difference(stored, _named(rest)):

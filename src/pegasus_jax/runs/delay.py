@@ -10,6 +10,7 @@ from pegasus_jax.checks import ConfigError, check_range
 from pegasus_jax.config import Config, Sensors
 from pegasus_jax.episode import drive
 from pegasus_jax.math.delays import MOST, Delay, delay_of, enough
+from pegasus_jax.memory import resting
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.task import Task
 
@@ -27,16 +28,16 @@ class Measured(NamedTuple):
 def measure(config: Config, amplitude: float = 0.1, periods: int = 200, most: int = MOST) -> Measured:
     """The delay of a config's environment, which is driven by random controls for so many periods, and then closed.
 
-    Each control is, in each period anew, one of two values: `amplitude` of half the control range above or below rest,
-    which is 0 or the limit next to it. An episode ends with a period of rest. No cost is needed. Raises ConfigError for
-    what cannot be, before anything moves, and RunError where the environment fails.
+    Each control is, in each period by a new draw, one of two values: `amplitude` of half the control range above or
+    below rest, which is 0 or the limit next to it. An episode ends with a period of rest. No cost is needed. Raises
+    ConfigError for what cannot be, before anything moves, and RunError where the environment fails.
     """
     check_range("amplitude", amplitude, 0, 1, open_low=True)
     check_range("most", most, 1, 100)
     task = _of_environment(config)
     check_range("periods", periods, most + enough(len(task.control_names), most), 10**6)
     low, high = np.asarray(task.control_low), np.asarray(task.control_high)
-    rest, size = np.clip(0.0, low, high), amplitude * (high - low) / 2
+    rest, size = resting(task), amplitude * (high - low) / 2
     draw, episodes = np.random.default_rng(config.seed), []
     try:
         while (left := periods - sum(len(u) for _, u in episodes)) > 0 and len(episodes) < EPISODES:

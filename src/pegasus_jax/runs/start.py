@@ -171,6 +171,7 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     """
     from pegasus_jax.assembly.experiments import build
     from pegasus_jax.runs import first, restore
+    from pegasus_jax.runs.begin import checked
     from pegasus_jax.runs.check import RESETS, before_training, circles_found
     from pegasus_jax.runs.logged import read_config
     from pegasus_jax.tasks import resolve
@@ -183,8 +184,6 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     config = first.found(resolve(asked.config))
     task = build(replace(first.loaded(config), seed=0), mesh).task
     resets = 1 if asked.config.start_mean else RESETS  # who says where episodes start has nobody reset a robot
-    from pegasus_jax.runs.begin import checked
-
     logs, notes = read_config(config, task)
     notes = checked(config, task) + circles_found(asked.config, config) + before_training(config, task, resets) + notes
     for note in notes:

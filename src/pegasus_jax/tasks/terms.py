@@ -154,8 +154,7 @@ def memories(task: Task, terms: tuple[str, ...]) -> list[Memory]:
 
 def controls(task: Task, count: int) -> Memory:
     """The newest `count` controls, which the policy does not see; before an episode they were 0, or what is nearest."""
-    rest = np.clip(np.zeros(len(task.control_names)), task.control_low, task.control_high)
-    return recall.past_controls(task.control_names, rest, count, shown=False)
+    return recall.past_controls(task.control_names, recall.resting(task), count, shown=False)
 
 
 def clock(task: Task, timed: bool) -> Memory:
