@@ -16,8 +16,8 @@ from benchmarks.paper.figures import Claim, Figure, read
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import BNN, RBF, SSGP, Analytic, Config
+from pegasus_jax.math.interquartile import interval, iqm
 from pegasus_jax.runs.study import first_solved, rounded, seed_list, study
-from pegasus_jax.viz.learning_curves import interval, iqm
 from probes import unchecked
 from test_train import call
 

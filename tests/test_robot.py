@@ -18,10 +18,10 @@ from pegasus_envs.gym_plant import env_spec
 from pegasus_jax import controller
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config
-from pegasus_jax.runs import config_io, store, study
+from pegasus_jax.runs import config_io, groups, store, study
 from pegasus_jax.runs.restore import restored
 from pegasus_jax.runs.store import RunError
-from pegasus_jax.viz.learning_curves import seeds_picture
+from pegasus_jax.viz.learning_curves import groups_picture
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "extending.md").read_text(), re.DOTALL)
@@ -206,9 +206,11 @@ def test_facts_that_are_given_are_not_asked_for() -> None:
 
 
 @pytest.mark.slow
-def test_runs_that_were_not_evaluated_have_no_curves_to_compare(learned: Path) -> None:
-    with pytest.raises(RunError, match="eval_episodes=0"):
-        seeds_picture([learned / "run"], learned / "learning.png")
+def test_runs_that_were_not_evaluated_are_compared_by_their_episodes(learned: Path) -> None:
+    runs, problems = groups.readable([learned / "run"])
+    assert not problems
+    assert groups.measured(groups.grouped(runs)) == groups.OWN
+    assert groups_picture(groups.grouped(runs), learned / "learning.png").stat().st_size > 1000
     with pytest.raises(ConfigError, match="eval_episodes=0"):
         study.study(Config(eval_episodes=0), [0])
     assert config_io.load(learned / "run" / "config.yaml").start_mean == (3.14, 0.0)

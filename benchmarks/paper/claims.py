@@ -7,8 +7,8 @@ import numpy as np
 
 from benchmarks.paper.comparison import Result, results, stored
 from benchmarks.paper.figures import Claim, Figure
+from pegasus_jax.math.interquartile import interval, iqm
 from pegasus_jax.runs.study import SOLVED, first_solved
-from pegasus_jax.viz.learning_curves import interval, iqm
 
 MISSING = "not run yet"
 SAME = 0.05  # a difference in mean cost a step that nobody would choose a variant for: from 1.0 to 0.3 is to be learned

@@ -72,12 +72,12 @@ SHA-256 over data, model and policy parameters. With json=true, one JSON object.
 """
 
 PLOT = """\
-pegasus-plot RUN     draw a run, or the runs of many seeds, finished or not
+pegasus-plot RUN|FOLDER     draw a run, or those in a folder, finished or not
 
 Writes RUN/plots/learning.png (cost and success against plant time) and RUN/plots/trial_NNNN.png for every trial:
 states, force and cost of the imagined particles after that trial, and over them what the plant did next.
-For a folder of seeds, FOLDER/learning.png: every seed's raw curve thin, their interquartile mean thick with its 95 %
-bootstrap interval.
+For a folder of runs, such as a sweep's, FOLDER/learning.png: those that differ in the seed alone have one color, every
+seed's raw curve thin, their interquartile mean thick with its 95 % bootstrap interval. pegasus-report shows more.
 """
 
 PLAY = """\

@@ -1,6 +1,7 @@
 """The commands that look at runs: pegasus-eval, -plot, -play."""
 
 import json
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,16 +23,24 @@ def evaluate(words: Sequence[str]) -> None:
 
 
 def plot(words: Sequence[str]) -> None:
-    run, _ = run_and(words, {}, many=True)
-    from pegasus_jax.runs import store
-    from pegasus_jax.viz.learning_curves import seeds_picture
-    from pegasus_jax.viz.run_plots import run_pictures
+    paths, _ = paths_and(words, {})
+    if len(paths) > 1:
+        raise ConfigError(f"name one run, or one folder of runs, not {len(paths)}; pegasus-report takes several")
+    from pegasus_jax.runs import groups, store
 
-    if runs := store.seeds_of(run):
-        print(seeds_picture(list(runs.values()), run / "learning.png"))
+    runs = groups.found(paths)
+    if len(runs) == 1:
+        from pegasus_jax.viz.run_plots import run_pictures
+
+        for path in run_pictures(runs[0], store.task_of(runs[0])):
+            print(path)
         return
-    for path in run_pictures(run, store.task_of(run)):
-        print(path)
+    from pegasus_jax.viz.learning_curves import groups_picture
+
+    compared, problems = groups.readable(runs)
+    for problem in problems:
+        print(f"note: left out: {problem}", file=sys.stderr)
+    print(groups_picture(groups.grouped(compared), paths[0] / "learning.png"))
 
 
 def play(words: Sequence[str]) -> None:
@@ -42,26 +51,34 @@ def play(words: Sequence[str]) -> None:
     print(film(run, episodes, seed, trial_of(rest["trial"]), rest["mjcf"] or None))
 
 
-def run_and(words: Sequence[str], defaults: dict[str, str], many: bool = False) -> tuple[Path, dict[str, str]]:
-    """The run's folder, or with `many` maybe that of several seeds, and the options of a command that reads it."""
+def run_and(words: Sequence[str], defaults: dict[str, str]) -> tuple[Path, dict[str, str]]:
+    """The run's folder, and the options of a command that reads it."""
+    from pegasus_jax.runs import store
+
+    paths, options = paths_and(words, defaults)
+    if len(paths) != 1:
+        raise ConfigError(f"name one run, not {len(paths)}; for example runs/cartpole-seed0")
+    (path,) = paths
+    if runs := store.seeds_of(path):
+        raise ConfigError(f"{path} holds the runs of {len(runs)} seeds; name one, for example {runs[min(runs)]}")
+    return store.existing(path), options
+
+
+def paths_and(words: Sequence[str], defaults: dict[str, str]) -> tuple[list[Path], dict[str, str]]:
+    """The folders that are named, and the options. Raises ConfigError for words that cannot be."""
     from pegasus_jax.checks import did_you_mean
-    from pegasus_jax.runs import config_io, store
+    from pegasus_jax.runs import config_io
 
     named = [word for word in words if "=" not in word]
-    if len(named) != 1:
-        raise ConfigError(f"name one run, not {len(named)}; for example runs/cartpole-seed0")
+    if not named:
+        raise ConfigError("name one run, not 0; for example runs/cartpole-seed0")
     _, rest = config_io.split([word for word in words if "=" in word])
     for key in rest:
         if key not in defaults:
             raise ConfigError(
                 f"{key} is not an option here; {did_you_mean(key, defaults) if defaults else 'there are none'}"
             )
-    path = Path(named[0])
-    if runs := store.seeds_of(path):
-        if not many:
-            raise ConfigError(f"{path} holds the runs of {len(runs)} seeds; name one, for example {runs[min(runs)]}")
-        return path, defaults | rest
-    return store.existing(path), defaults | rest
+    return [Path(word) for word in named], defaults | rest
 
 
 def trial_of(text: str) -> int | str:

@@ -37,7 +37,7 @@ examples
   pegasus-sweep task=cartpole search.grad_clip=1,10,100 seed=0-2
   pegasus-sweep task=cartpole policy.hidden=[50,50],[200,200] seed=0-9 | xargs -d '\\n' -P 2 -I{} sh -c {}
   pegasus-sweep task=cartpole,double_cartpole seeds=10 launcher=slurm slurm.gpus_per_node=1 slurm.time=60
-  pegasus-plot runs/sweep/search.grad_clip-10     the curves of one combination's seeds
+  pegasus-report runs/sweep     all of its runs side by side
 """
 
 OPTIONS = ("launcher", "jobs", "out", "seeds", "mesh")

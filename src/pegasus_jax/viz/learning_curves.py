@@ -10,27 +10,24 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from scipy.stats import bootstrap, trim_mean
 
-from pegasus_jax.checks import RunError
+from pegasus_jax.math.interquartile import interval, iqm
 from pegasus_jax.runs.files import write_whole
-from pegasus_jax.runs.store import trials
+from pegasus_jax.runs.groups import Group, measured, plant_seconds
 
 
-def seeds_picture(runs: Sequence[Path], path: Path) -> Path:
-    """Draw cost and success of the runs against plant time, as far as every run has come."""
-    rows = [trials(run) for run in runs]
-    shared = min(map(len, rows))
-    if not shared:
-        raise RunError(f"{runs[0].parent}: not every run has a finished trial yet")
-    if any(row["mean_cost"] is None for run in rows for row in run[:shared]):
-        raise RunError(
-            f"{runs[0].parent}: these runs were not evaluated (eval_episodes=0); pegasus-plot draws each alone"
+def groups_picture(groups: Sequence[Group], path: Path) -> Path:
+    """Draw cost and success of runs that exist against plant time, a color for each group of seeds."""
+    kind = measured(groups)
+    results = {
+        f"{group.label} ({len(group.runs)} seed{'s'[: len(group.runs) > 1]})": (
+            plant_seconds(group),
+            group.curves(kind.cost),
+            group.curves(kind.success),
         )
-    cost, success = ([[row[name] for row in run[:shared]] for run in rows] for name in ("mean_cost", "success_rate"))
-    picture(
-        {f"{len(runs)} seeds": (np.asarray(cost), np.asarray(success))}, [r["plant_seconds"] for r in rows[0]], path
-    )
+        for group in groups
+    }
+    _picture(results, path, kind.words)
     return path
 
 
@@ -38,11 +35,16 @@ def picture(
     results: dict[str, tuple[np.ndarray, np.ndarray]], seconds: list[float], path: Path, title: str = ""
 ) -> None:
     """Draw label -> (mean cost [S, T], success rate [S, T]) against plant time [s]."""
+    _picture({label: (seconds[: cost.shape[1]], cost, good) for label, (cost, good) in results.items()}, path, title)
+
+
+def _picture(results: dict[str, tuple[list[float], np.ndarray, np.ndarray]], path: Path, title: str) -> None:
     figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(7, 6))
-    for color, (label, (cost, success)) in enumerate(results.items()):
-        curves(top, seconds[: cost.shape[1]], cost, f"C{color}", label)
-        curves(bottom, seconds[: cost.shape[1]], success, f"C{color}", label)
-    top.set(title=title, ylabel="mean cost a step")
+    for color, (label, (seconds, cost, success)) in enumerate(results.items()):
+        curves(top, seconds, cost, f"C{color}", label)
+        curves(bottom, seconds, success, f"C{color}", label)
+    top.set(ylabel="mean cost a step")
+    top.set_title(title, fontsize=10)
     bottom.set(ylabel="success rate", xlabel="plant time [s]")
     top.legend(frameon=False)
     figure.tight_layout()
@@ -83,25 +85,3 @@ def areas_picture(
     figure.tight_layout()
     write_whole(path, lambda file: figure.savefig(file, format="png", dpi=110))
     plt.close(figure)
-
-
-def iqm(values: np.ndarray, axis: int = 0) -> np.ndarray:
-    """The interquartile mean over seeds, the first axis."""
-    return trim_mean(values, 0.25, axis=axis)
-
-
-def interval(*samples: np.ndarray, paired: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """The 95 % bootstrap interval of the interquartile mean over seeds [S, ...]; of two samples, of the difference.
-
-    `paired` says that both samples have the same seeds, in one order. Unbounded for a single seed, which says nothing
-    of the others.
-    """
-    if min(map(len, samples)) < 2:
-        return np.full(samples[0].shape[1:], -np.inf), np.full(samples[0].shape[1:], np.inf)
-
-    def statistic(first: np.ndarray, *second: np.ndarray, axis: int) -> np.ndarray:
-        return iqm(first, axis) - sum(iqm(other, axis) for other in second)
-
-    options: dict = dict(axis=0, n_resamples=2000, method="percentile", paired=paired, rng=np.random.default_rng(0))
-    found = bootstrap(samples, statistic, **options).confidence_interval
-    return found.low, found.high
