@@ -12,12 +12,14 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from pegasus_jax.runs import display as progress
 from pegasus_jax.runs.config_io import parse
 from pegasus_jax.runs.display import Clock, Display, announcement, best_line, duration, stopped, summary
+from pegasus_jax.runs.trials_table import PLAIN, spark
 
 ROW: dict[str, Any] = {
     "trial": 7,
@@ -164,9 +166,52 @@ def test_a_terminal_says_that_it_compiles_and_goes_on(monkeypatch: pytest.Monkey
         assert display.live is not None
         display.phase(2, "search", 0.5)
         with display.compiling("search"):
-            assert display.live.tasks[0].description == "compiling the search (once)"
-        assert display.live.tasks[0].description == "trial 2/3  searching a policy"
-        assert display.live.tasks[0].completed == 0.5
+            assert display.progress.tasks[0].description == "compiling the search (once)"
+        assert display.progress.tasks[0].description == "trial 2/3  searching a policy"
+        assert display.progress.tasks[0].completed == 0.5
+
+
+def test_a_terminal_has_a_table_of_the_trials() -> None:
+    text = io.StringIO()
+    rows = [
+        ROW | {"trial": n, "mean_cost": 1 - n / 4, "success_rate": n / 4, "objective_fresh": 0.3} for n in (1, 2, 3)
+    ]
+    with Display(4, Console(file=text, force_terminal=True, width=120, height=30)).running() as display:
+        for number, known in enumerate(rows, 1):
+            display.phase(number, "search", 0.5)
+            display.trial([known])
+        display.phase(4, "fit", 0.1)
+        display.clock.steady = [60.0]
+        screen = Console(file=io.StringIO(), width=120)
+        screen.print(display._now())
+        lines = screen.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert lines[0].split("  ")[0] == "trial"
+    assert "plant [s]" in lines[0]
+    assert [line.split()[0] for line in lines[1:4]] == ["1/4", "2/4", "3/4"]
+    assert lines[3].split()[2:6] == ["0.375", "0.250", "75%", "0.298"]
+    assert lines[4] == "cost ▇▅▃   success ▃▅▇"
+    assert lines[5] == "best so far: trial 3 (success 75%, cost 0.250)"
+    assert lines[6].startswith("trial 4/4  fitting the model")
+    assert lines[6].rstrip().endswith("about 60 s left")
+    assert text.getvalue().count("3/4") >= 1  # the table stays when the display ends
+
+
+@pytest.mark.parametrize(
+    ("values", "drawn"), [([0, 0.5, 1], "▁▅█"), ([2, np.nan, 1], "█ ▅"), ([-1, 0], "▁▁"), ([], "")]
+)
+def test_a_curve_of_one_line(values: list[float], drawn: str) -> None:
+    assert spark(values) == drawn
+    assert len(spark(values, PLAIN)) == len(drawn)
+
+
+def test_a_table_makes_room_for_what_a_robot_asks() -> None:
+    text = io.StringIO()
+    with Display(2, Console(file=text, force_terminal=True, width=100)).running() as display:
+        display.asks = True
+        display.phase(1, "collect")
+        assert display.live is None
+        display.phase(1, "fit")
+        assert display.live is not None
 
 
 def test_nothing_slow_is_imported_before_the_first_line() -> None:

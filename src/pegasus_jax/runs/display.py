@@ -12,10 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rich.console import Console
+from rich.console import Console, Group
+from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
 from pegasus_jax.config import Config, label
+from pegasus_jax.runs.trials_table import BLOCKS, PLAIN, best, curves, solved, table
 
 # A phase, and what it is called. A trial that begins with `read` finds its episode on disk, for example after a kill.
 PHASES = {
@@ -39,33 +41,40 @@ PARTS = {
 BRIEF = 1.0  # [s] a phase that is shorter has no line in a log
 SILENCE = 10.0  # [s] after so long a log has a line again
 LATEST = 3  # so many trials say how long the next one takes
+AROUND = 8  # lines of a terminal that the table leaves free
 COMPILING = 0.1  # a trial that waits for the compiler for more than this part of its time says nothing of the next
 
 
 class Display:
-    """Shows where a run is: a live line on a terminal, elsewhere a line for every phase that takes a while.
+    """Shows where a run is: a live table on a terminal, elsewhere a line for every phase that takes a while.
 
-    `phase` and `compiling` say what is being done, `line` prints a line that stays.
+    `phase` and `compiling` say what is being done, `trial` how one went, `line` prints a line that stays.
     """
 
     def __init__(self, trials: int, console: Console | None = None, quiet: bool = False) -> None:
         self.console = console or Console(file=sys.stderr, highlight=False, quiet=quiet)
         self.trials = trials
+        self.asks = False  # whether an episode may speak with a person, as a robot's reset does: the table makes room
+        self.done: list[Sequence[dict[str, Any]]] = []  # the rows of each finished trial, one a seed
         self.what, self.stage, self.since = "preparing", "preparing", time.monotonic()
         self.said, self.spoke = "", self.since  # the last line of a log, and when
         self.clock = Clock()
-        self.live: Progress | None = None
-        self.task: Any = None
+        self.live: Live | None = None
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[left]}"))
+        self.progress = Progress(*columns, console=self.console, auto_refresh=False)
+        self.task = self.progress.add_task(self.what, total=1.0, left="")
 
     @contextmanager
     def running(self) -> Iterator[Display]:
         """Keep the display up until the block ends."""
         if self.console.is_terminal:
-            columns = (TextColumn("{task.description}"), BarColumn(bar_width=20), TextColumn("{task.fields[left]}"))
-            with Progress(*columns, console=self.console, transient=True) as self.live:
-                self.task = self.live.add_task(self.what, total=1.0, left="")
+            self._show_live()
+            try:
                 yield self
-            self.live = None
+            finally:
+                self._hide()
+                if self.done:
+                    self.console.print(table(self.done, self.trials))
             return
         over = threading.Event()
         speaker = threading.Thread(target=self._log, args=(over,), daemon=True)
@@ -79,14 +88,15 @@ class Display:
     def phase(self, trial: int, what: str, fraction: float = 0.0, cost: Any = None) -> None:
         """Trial `trial` is doing `what`; `fraction` of it is done, and `cost` [] is what was imagined last."""
         self.clock.phase(trial, what)
-        left = self.clock.left(self.trials)
         note = "" if cost is None else f"  imagined cost {float(cost):.3f}"
-        self._show(
-            f"trial {trial}/{self.trials}  {PHASES.get(what, what)}{note}",
-            fraction,
-            "" if left is None else f"about {duration(left)} left",
-            stage=f"{trial} {what}",
-        )
+        words = f"trial {trial}/{self.trials}  {PHASES.get(what, what)}{note}"
+        self._show(words, fraction, stage=f"{trial} {what}")
+        if self.asks and self.console.is_terminal:
+            if what == "collect":
+                self._hide()
+                self.line(words)
+            else:
+                self._show_live()
 
     @contextmanager
     def compiling(self, part: str) -> Iterator[None]:
@@ -99,19 +109,52 @@ class Display:
             self.clock.compiled += time.monotonic() - began
             self._show(before)
 
+    def trial(self, rows: Sequence[dict[str, Any]]) -> None:
+        """A trial is done, with these rows, one a seed: a row of the table, or a line of a log."""
+        self.done.append(rows)
+        if not self.console.is_terminal:
+            self.line(summary(rows, self.trials))
+        elif note := "  ".join(filter(None, (limits(rows), skipped(rows)))):
+            self.line(f"trial {rows[0]['trial']}: {note}")
+
     def line(self, text: str) -> None:
         """Print a line that stays."""
         self.spoke = time.monotonic()
         self.console.print(text, markup=False, soft_wrap=True)
 
-    def _show(self, what: str, fraction: float | None = None, left: str | None = None, stage: str = "") -> None:
+    def _show(self, what: str, fraction: float | None = None, stage: str = "") -> None:
         stage = stage or what
         if stage != self.stage:
             self.stage, self.since = stage, time.monotonic()
         self.what = what
+        self.progress.update(self.task, description=what, completed=fraction)
+
+    def _show_live(self) -> None:
+        if self.live is None:
+            self.live = Live(get_renderable=self._now, console=self.console, transient=True)
+            self.live.start()
+
+    def _hide(self) -> None:
+        """Take the table off the terminal; a Live that was stopped cannot go on, so the next one is another."""
         if self.live is not None:
-            fields: dict[str, Any] = {} if left is None else {"left": left}
-            self.live.update(self.task, description=what, completed=fraction, **fields)
+            self.live.stop()
+            self.live = None
+
+    def _now(self) -> Group:
+        """What a terminal shows: the trials that have room, their curves, the best so far, what is happening."""
+        left = self.clock.left(self.trials)
+        self.progress.update(self.task, left="" if left is None else f"about {duration(left)} left")
+        parts: list[Any] = []
+        if done := self.done:
+            room = max(self.console.height - AROUND, 3)
+            parts += [table(done[-room:], self.trials, max(len(done) - room, 0))]
+            parts += [curves(done, BLOCKS if "utf" in self.console.encoding.lower() else PLAIN)]
+            number = best(done) if len(done[0]) == 1 else None
+            of_one = (
+                "" if number is None else best_line([rows[0] for rows in done], number).replace("policy", "so far", 1)
+            )
+            parts += [of_one if len(done[0]) == 1 else solved(done[-1])]
+        return Group(*parts, self.progress.get_renderable())
 
     def _log(self, over: threading.Event) -> None:
         """The lines of a log, printed by a thread because the phases themselves are at work."""
@@ -185,7 +228,6 @@ def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
     """A trial in one line, from the row of each seed; of several seeds the means, and the median of the errors."""
     first, several = rows[0], len(rows) > 1
     measured = first["mean_cost"] is not None
-    skipped = sum(row["skipped_updates"] for row in rows)
     solved = sum(row["success_rate"] >= 0.9 for row in rows) if measured else 0
     errors = [row["calibration"] for row in rows if row["calibration"] is not None]
     parts = [
@@ -195,7 +237,7 @@ def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
         learned(rows),
         f"{solved} of {len(rows)} seeds solved" if measured and several else "",
         f"model errors {np.median(errors):.1f} times as large as predicted" if errors else "",
-        f"{skipped} updates skipped" if skipped else "",
+        skipped(rows),
         limits(rows),
         f"({sum(first['seconds'].values()):.0f} s, {first['seconds']['compile']:.0f} s of it compiling)",
     ]
@@ -221,6 +263,12 @@ def learned(rows: Sequence[dict[str, Any]]) -> str:
         parts.append(f"imagined cost {imagined:.3f}")
     kept = all(row.get("replaced") is False for row in rows)
     return f"policy {'kept' if kept else 'now'}: {', '.join(parts)}" if parts else ""
+
+
+def skipped(rows: Sequence[dict[str, Any]]) -> str:
+    """How many updates of fit and search were not finite; "" for none."""
+    count = sum(row.get("skipped_updates") or 0 for row in rows)
+    return f"{count} updates skipped" if count else ""
 
 
 def limits(rows: Sequence[dict[str, Any]]) -> str:

@@ -53,6 +53,7 @@ def opened(config: Config, seeds: Sequence[int], mesh: Mesh | None = None, logs:
     try:
         program = Program(experiment, config.search.steps, len(seeds), mesh)
         display = Display(config.trials, quiet=not is_main_process())
+        display.asks = experiment.task.environment is not None
         with display.running():
             program.on_compile = display.compiling
             yield Job(config, seeds, experiment, program, display, writers.nothing(len(seeds)), logs)

@@ -23,7 +23,7 @@ from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.logs.read import Logged
 from pegasus_jax.runs import begin, checkpoint, config_io, logged, restore, store, writers
 from pegasus_jax.runs.collect import collected, stacked
-from pegasus_jax.runs.display import learned, summary
+from pegasus_jax.runs.display import learned
 from pegasus_jax.runs.evaluation import UNMEASURED, evaluate, kept_to, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
 from pegasus_jax.runs.programs import gather, is_main_process
@@ -95,12 +95,14 @@ def train_seeds(
             raise RunError(
                 f"{folders[0] / 'config.yaml'} has trials={config.trials}, and {most} are done; expected at least that"
             )
+        done = None if stored is None else int(stored.trial[0])
         states = first_states(job, stored, changed=(config.fit, config.search) != (before.fit, before.search))
         if stored is None:
             states = begin.begun(states, config, folders[0])
+        job.display.done += zip(*(store.readable_trials(run)[0][: int(done or 0)] for run in folders), strict=False)
         multihost_utils.sync_global_devices("every process has read what there is")
         job = job._replace(writer=writers.run_folders(runs, config, task, command, say))
-        states = learn(job, states, None if stored is None else int(stored.trial[0]))
+        states = learn(job, states, done)
         if final:
             collected(job, states, config.trials + 1)
     return states
@@ -122,7 +124,8 @@ def learn(job: Job, states: RunState, done: int | None = None) -> RunState:
     for trial in range((done or 0) + 1, job.config.trials + 1):
         states, rows = one_trial(job, states, trial)
         job.writer.trial(trial, states, rows)
-        for line in (summary(rows, job.config.trials), *stuck(before, rows)):
+        job.display.trial(rows)
+        for line in stuck(before, rows):
             job.display.line(line)
         before = [] if "logs" in rows[0] else rows
     return states
