@@ -23,7 +23,7 @@ LAYERS = {
     5: "tasks. pilco. experiment",
     6: "assembly. logs.",
     7: "runs.",
-    8: "viz. exports.",
+    8: "viz. exports. report.",
     9: "cli. deploy __init__",
 }
 APPLICATION = 7  # the first layer that knows of files, terminals and people

@@ -1,0 +1,69 @@
+"""The command pegasus-report: runs as one page that needs nothing else."""
+
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.cli.main import main
+from pegasus_jax.cli.runs import paths_and
+
+REPORT = """\
+pegasus-report RUN [out=RUN/report.html] [film=false] [csv=FOLDER]     a run as one HTML file
+pegasus-report FOLDER|RUN ... [out=FOLDER/report.html]                 several runs side by side
+
+Of a run, finished or not: warnings and what they mean, learning curves, calibration, each trial's real trajectory over
+the imagined ones, controls, the film of pegasus-play, the best policy, settings, versions. The file needs no network.
+
+Of a folder, such as a sweep's, the runs in it and in its folders: those that differ in the seed alone are a group, with
+interquartile means and their 95 % bootstrap intervals, and every seed's raw curve. Nothing is trained.
+
+  out=FILE      where the page is written (of several runs without a folder for all: report.html)
+  film=true     film the best policy first, as pegasus-play RUN trial=best does; of one run
+  csv=FOLDER    write every curve there as CSV too; the page has them as links
+
+examples
+  pegasus-report runs/cartpole-seed0
+  pegasus-report runs/sweep out=sweep.html csv=curves
+"""
+
+
+def report() -> None:
+    """Entry point of pegasus-report."""
+    main(handle, REPORT, stopped="nothing was written")
+
+
+def handle(words: Sequence[str]) -> None:
+    """Write the report of the runs named. Raises ConfigError for words that cannot be."""
+    paths, options = paths_and(words, {"out": "", "film": "false", "csv": ""})
+    if options["film"] not in ("true", "false"):
+        raise ConfigError(f"film={options['film']} is neither true nor false")
+    from pegasus_jax.runs import groups
+
+    runs = groups.found(paths)
+    if options["film"] == "true":
+        if len(runs) > 1:
+            raise ConfigError(f"film=true is for one run, not {len(runs)}; for example {runs[0]}")
+        from pegasus_jax.viz.video import film
+
+        film(runs[0], 1, 0, "best")
+    on_cpu()
+    from pegasus_jax.report import build
+
+    out = Path(options["out"] or (paths[0] / "report.html" if len(paths) == 1 else "report.html"))
+    made = build.report(paths)
+    for problem in made.problems:
+        print(f"note: left out: {problem}", file=sys.stderr)
+    for path in build.write(made, out, Path(options["csv"]) if options["csv"] else None):
+        print(path)
+
+
+def on_cpu() -> None:
+    """Leave a GPU to the runs that are learning: who only reads asks for none. Not once JAX is there."""
+    if "jax" not in sys.modules:
+        os.environ["JAX_PLATFORMS"] = "cpu"
+
+
+if __name__ == "__main__":
+    report()

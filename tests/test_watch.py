@@ -1,0 +1,134 @@
+"""pegasus-watch: a page on localhost that renews itself, and ends when it is told to."""
+
+from __future__ import annotations
+
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+import pytest
+
+import browser
+from folders import a_run, row
+from pegasus_jax.checks import ConfigError, RunError
+from pegasus_jax.cli import watch
+from pegasus_jax.report import serve
+from pegasus_jax.report.progress import state
+from pegasus_jax.runs import store
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return a_run(tmp_path_factory.mktemp("watch") / "run")
+
+
+@pytest.fixture
+def run(made: Path, tmp_path: Path) -> Path:
+    """A run of three trials, two of which are done."""
+    copy = shutil.copytree(made, tmp_path / "run")
+    store.write_trials(copy, [row(trial, seconds={"fit": 40.0, "compile": 99.0}) for trial in (1, 2)])
+    return copy
+
+
+@contextmanager
+def served(path: Path) -> Iterator[str]:
+    with serve.server([path], 0) as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
+        thread.start()
+        yield f"http://127.0.0.1:{server.server_port}/"
+        server.shutdown()
+        thread.join()
+
+
+def test_a_new_trial_appears_by_itself_and_what_is_open_stays_open(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The browser opens a fold; then the third trial is done; then the page has it, and the fold is still open."""
+    asked: list[Path] = []
+
+    def learn(paths: Sequence[Path]) -> str:
+        asked.extend(paths)
+        if len(asked) == 3:  # two seconds after the page was there
+            store.write_trials(run, [row(trial) for trial in (1, 2, 3)])
+        return state(paths)
+
+    monkeypatch.setattr(serve, "state", learn)
+    until = """(() => {
+        const fold = document.getElementById('trial-1')
+        if (fold && !window.was) { window.was = document.querySelector('#trials table').rows.length; fold.open = true }
+        return Boolean(window.was && document.querySelector('#trials table').rows.length > window.was)
+    })()"""
+    with served(run) as address:
+        script = "[window.was, document.querySelector('#trials table').rows.length,"
+        script += " document.getElementById('trial-1').open, document.title]"
+        seen = browser.opened(address, script, until=until)
+    assert seen["found"] == [3, 4, True, "cartpole, seed 0"]  # rows with the head
+    assert seen["console"] == []
+    assert all(one.startswith((address, "data:")) for one in seen["asked"])
+
+
+def test_a_page_is_sent_again_only_where_it_changed(run: Path) -> None:
+    with served(run) as address:
+        first = urlopen(f"{address}content")
+        again = Request(f"{address}content", headers={"If-None-Match": first.headers["ETag"]})
+        with pytest.raises(HTTPError, match="304"):
+            urlopen(again)
+        store.write_trials(run, [row(trial) for trial in (1, 2, 3)])
+        assert urlopen(again).status == 200
+        for wrong, headers in (("etc/passwd", {}), ("", {"Host": "example.com"})):
+            with pytest.raises(HTTPError, match=r"40[34]"):
+                urlopen(Request(address + wrong, headers=headers))
+
+
+def test_what_happens_now_is_said(run: Path) -> None:
+    assert state([run]) == "trial 3 of 3: its episode has run, it is being learned from; about 40 s left"
+    store.episode_path(run, 3).unlink()
+    assert state([run]).startswith("trial 3 of 3: waiting for its episode")
+    store.write_trials(run, [row(trial) for trial in (1, 2, 3)])
+    assert state([run]) == "done: 3 of 3 trials"
+    assert state([run.parent / "gone"]).startswith(f"{run.parent / 'gone'} is not a run")
+
+
+def test_a_run_without_a_trial_is_waited_for(run: Path) -> None:
+    (run / "trials.jsonl").unlink()
+    with served(run) as address:
+        assert b"No trial is finished yet" in urlopen(f"{address}content").read()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ([], "name one run, not 0"),
+        (["nowhere"], "nowhere is not a run"),
+        (["RUN", "port=http"], "port=http is not a whole number; for example port=8765"),
+        (["RUN", "port=70000"], r"port=70000 is out of range; expected a number in [0, 65535]; the nearest is 65535"),
+        (["RUN", "prot=1"], "prot is not an option here; did you mean 'port'"),
+        (["RUN", "port=TAKEN"], "is used by another program; for example port="),
+    ],
+)
+def test_what_cannot_be_watched_is_one_line(run: Path, words: list[str], says: str) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        with pytest.raises((ConfigError, RunError)) as caught:
+            watch.handle([word.replace("RUN", str(run)).replace("TAKEN", port) for word in words])
+    assert says in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_signal_ends_it_cleanly(run: Path) -> None:
+    program = [sys.executable, "-c", "from pegasus_jax.cli.watch import watch; watch()", str(run), "port=0"]
+    process = subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    address = process.stdout.readline().split()[0]
+    assert b"pegasus-watch" in urlopen(address).read()
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (130, "stopped; the run goes on\n")
