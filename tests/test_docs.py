@@ -12,11 +12,13 @@ import os
 import re
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
 from typing import NamedTuple
+from urllib.request import urlopen
 
 import jax
 import pytest
@@ -72,6 +74,7 @@ CHECKOUT = ("Makefile", "pyproject.toml", "requirements.lock", "benchmarks", "sr
 NOT_RUN = {
     "make test": "it would run this test again",
 }
+SERVES = "pegasus-watch "  # until a person ends it
 TINY = "fit.steps=3 search.steps=4"
 SMALL = {  # a part of a command -> a setting that makes it small, unless the command is about that
     "model=": "model.hidden=[8]",
@@ -141,8 +144,29 @@ def test_a_page_runs_from_the_top_to_the_end(page: Path, tmp_path: Path, tools: 
         if block.file and USED.search(block.text):
             shell(f"python {block.file}", tmp_path, tools)
         for command in commands(block) if block.kind in ("", "bash", "sh") else ():
-            if command not in NOT_RUN:
+            if command.startswith(SERVES):
+                watched(command, tmp_path, tools)
+            elif command not in NOT_RUN:
                 shell(command, tmp_path, {**tools, "PEGASUS_SETTINGS": cut(command)})
+
+
+def watched(command: str, folder: Path, environment: dict[str, str]) -> None:
+    """A command that serves a page until Ctrl-C; on any port, as another test may have its own."""
+    words = shlex.split(f"exec {command} port=0")
+    process = subprocess.Popen(
+        shlex.join(words),
+        shell=True,
+        cwd=folder,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    address = process.stdout.readline().split()[0]
+    assert urlopen(f"{address}/content").status == 200
+    process.send_signal(signal.SIGINT)
+    assert process.wait(timeout=60) == 130
 
 
 def append(path: Path, text: str) -> None:

@@ -286,12 +286,16 @@ def test_bad_words_are_one_line(run: Path, sweep: Path, words: list[str], says: 
     assert "\n" not in str(caught.value)
 
 
-def test_a_film_is_in_the_page(run: Path, tmp_path: Path) -> None:
+def test_the_film_of_the_best_policy_is_in_the_page(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def film(run: Path, episodes: int, seed: int, trial: str) -> None:
+        (run / "play.mp4").write_bytes(f"a film of {episodes}, {trial}".encode())
+
+    monkeypatch.setattr("pegasus_jax.viz.video.film", film)
     copy = shutil.copytree(run, tmp_path / "run")
-    (copy / "play.mp4").write_bytes(b"a film")
-    found = whole(html(copy))
+    command.handle([str(copy), "film=true"])
+    found = whole((copy / "report.html").read_text())
     assert "video" in found.tags
-    assert inside(found, "video/mp4") == ["a film"]
+    assert inside(found, "video/mp4") == ["a film of 1, best"]
 
 
 SEEN = """(() => {

@@ -121,6 +121,9 @@ def faulty() -> list[Command]:
     return [train(f"env={env}-v0", f"cost={cost}", begin=GYM, refused=not fine & {env, cost}) for env, cost in pairs]
 
 
+FOLDERS = (".", "/")  # pegasus-plot takes folders of runs
+
+
 def of_runs() -> list[Command]:
     """The commands that read a run, with options that they have not; `run` is one that is there."""
     words = words_of(
@@ -136,7 +139,11 @@ def of_runs() -> list[Command]:
         " out= seed=0-99999999999 trials=[1 model=bnn,gpp slurm.time=1 resume=run"
     )
     return [
-        *(Command(name, tuple(word.split(":")), refused=True) for name in readers for word in words),
+        *(
+            Command(name, tuple(word.split(":")), refused=name != "pegasus-plot" or word not in FOLDERS)
+            for name in readers
+            for word in words
+        ),
         *(Command("pegasus-sweep", ("launcher=print", *word.split(":")), refused=True) for word in sweeps),
         *(Command("pegasus-check", (*SMALL, word), refused=True) for word in ("trials=0", "serach.steps=1")),
     ]

@@ -45,8 +45,8 @@ examples
   pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
   pegasus-train resume=runs/demo trials=20 search.steps=2000
 
-Look at a run, finished or not, with pegasus-plot RUN, pegasus-eval RUN or pegasus-play RUN; or with
-tensorboard --logdir RUN/tensorboard, after pip install tensorboard.
+Look at a run, finished or not, with pegasus-report RUN, pegasus-watch RUN, pegasus-plot RUN, pegasus-eval RUN or
+pegasus-play RUN; or with tensorboard --logdir RUN/tensorboard, after pip install tensorboard.
 """
 
 CHECK = """\

@@ -23,8 +23,7 @@ HEAD = (  # of the table of trials
     "model error",
     "inside band",
     "controls at limits",
-    "computing [s]",
-    "compiling [s]",
+    "computing + compiling [s]",
 )
 
 
@@ -95,6 +94,7 @@ def trials(found: Look) -> str:
 def _row(row: dict[str, Any], best: bool, covered: dict[int, float | None]) -> list[str]:
     """The cells of a trial; it leads to its trajectories, where there are some."""
     trial, seconds = row["trial"], row.get("seconds") or {}
+    compiling = seconds.get("compile", 0.0)
     name = f'<a href="#trial-{trial}">{trial}</a>' if trial in covered else str(trial)
     return [
         f"{name} <b>best</b>" if best else name,
@@ -107,6 +107,5 @@ def _row(row: dict[str, Any], best: bool, covered: dict[int, float | None]) -> l
         number(row.get("calibration"), ".2f"),
         number(covered.get(trial), ".0%"),
         number(row.get("saturated"), ".0%"),
-        number(sum(seconds.values()) - seconds.get("compile", 0.0) if seconds else None, ".1f"),
-        number(seconds.get("compile"), ".1f"),
+        f"{sum(seconds.values()) - compiling:.0f} + {compiling:.0f}" if seconds else "–",
     ]

@@ -10,7 +10,7 @@ STYLE = """
 *{box-sizing:border-box}
 html{scroll-behavior:smooth;scroll-padding-top:1rem}
 body{margin:0;color:var(--ink);background:var(--back);font:15px/1.5 system-ui,"Segoe UI","DejaVu Sans",sans-serif}
-#content{display:grid;grid-template-columns:13rem minmax(0,62rem);gap:2.5rem;max-width:82rem;margin:auto;padding:1.5rem}
+#content{display:grid;grid-template-columns:12rem minmax(0,64rem);gap:2rem;max-width:82rem;margin:auto;padding:1.5rem}
 nav{position:sticky;top:1.5rem;align-self:start;font-size:14px;color:var(--soft);max-height:95vh;overflow:auto}
 nav ol{list-style:none;margin:.4rem 0;padding:0;border-left:2px solid var(--line)}
 nav a{display:block;padding:.15rem .8rem;color:inherit;text-decoration:none}

@@ -200,7 +200,7 @@ def _summed_up(asked: Asked) -> None:
         for line in filter(None, (display.limits_line(store.trials(run)), told)):
             print(f"seed {seed}: {line}" if len(asked.runs) > 1 else line)
     home = asked.home
-    print(f"done: {home} (pegasus-plot {home}, pegasus-eval {next(iter(asked.runs.values()))})")
+    print(f"done: {home} (pegasus-report {home}, pegasus-eval {next(iter(asked.runs.values()))})")
 
 
 def _evenly(seeds: int) -> Mesh:

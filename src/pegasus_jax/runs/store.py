@@ -13,6 +13,7 @@
         checkpoints/0001/    the state after trial 1, with 0001.json: the SHA-256 of each of its files
         tensorboard/         the numbers of trials.jsonl as scalars
         driven/0001.npz      of pegasus-run, never data: as an episode, with when each control was sent, and overruns
+        report.html          of pegasus-report, made of the files above; play.mp4 of pegasus-play
         controller.py        and .h, .onnx, .stablehlo: of pegasus-export, each with its contract, controller.py.json
 
 Files appear whole or not at all: written beside their place, flushed to disk, then renamed.
@@ -45,7 +46,7 @@ FILES = ("config.yaml", "run.json", "trials.jsonl", ".lock")
 FOLDERS = ("episodes", "logged", "imagined", "checkpoints", "tensorboard", "plots")
 # What a killed process was writing (files.beside, orbax), and pegasus-play.
 UNFINISHED = re.compile(
-    r"\.(\d{4,}\.(npz|json)|trials\.jsonl|run\.json|config\.yaml|learning\.png|trial_\d{4,}\.png)"
+    r"\.(\d{4,}\.(npz|json)|trials\.jsonl|run\.json|config\.yaml|learning\.png|report\.html|trial_\d{4,}\.png)"
     r"\.\w{8}|\.play\.\w{8}|\d{4,}\.orbax-checkpoint-tmp.*"
 )
 EPISODE = ("x", "u", "cost", "task", "trial", "policy", "ended", "horizon")  # what every episode's file has
