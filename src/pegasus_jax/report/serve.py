@@ -35,7 +35,7 @@ async function renew() {
       document.getElementById('content').innerHTML = await answer.text()
       if (!first) for (const [id, was] of open) { const now = document.getElementById(id); if (now) now.open = was }
       document.title = document.querySelector('h1').textContent
-      scrollTo(x, y)
+      scrollTo({left: x, top: y, behavior: 'instant'})
     }
     note.textContent = (await (await fetch('state', {cache: 'no-store'})).json()).words
   } catch { note.textContent = 'pegasus-watch has ended; the page stays as it was' }
