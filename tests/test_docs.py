@@ -166,7 +166,8 @@ def watched(command: str, folder: Path, environment: dict[str, str]) -> None:
     address = process.stdout.readline().split()[0]
     assert urlopen(f"{address}/content").status == 200
     process.send_signal(signal.SIGINT)
-    assert process.wait(timeout=60) == 130
+    _, error = process.communicate(timeout=60)
+    assert (process.returncode, error) == (130, "stopped; the run goes on\n")
 
 
 def append(path: Path, text: str) -> None:
