@@ -101,7 +101,9 @@ class Search:
         "gaussian", "gaussian: expected cost of the matched Gaussian; particles: mean cost of the particles"
     )
     refine_fraction: float = setting(
-        0.0, "last part of a search, as a fraction, which refines the better of the new policy and the old one"
+        0.0,
+        "last part of a search, as a fraction, which refines the better of the new policy and the old one;"
+        " after an episode that succeeded the only part",
     )
     cost_width_start: float = setting(
         4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it"

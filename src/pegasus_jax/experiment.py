@@ -100,6 +100,7 @@ def experiment(
     explore: Callable[[Key], Array],
     explore_trials: int,
     first_search: int,
+    refine_successes: bool = False,
     begun: bool = False,
     compare: bool,
     capacity: int,
@@ -111,7 +112,8 @@ def experiment(
     the first time; 0: before the first episode. One that is `begun` has learned elsewhere before that. With `compare` a
     policy whose newest episode succeeded is followed only by one that is expected to cost less.
     `remember(posterior, state)` is what all of them are given in a posterior's place. With an environment instead of a
-    plant in JAX, `episode` and `collect` are not pure, and `drive` is there.
+    plant in JAX, `episode` and `collect` are not pure, and `drive` is there. With `refine_successes` the search
+    after an episode that succeeded is called with second=True.
     """
     states, controls, memory = len(task.state_names), len(task.control_names), task.memory
     see, given, advance = recall.steps(memory)
@@ -248,6 +250,7 @@ def experiment(
         # that knows nothing is the better start.
         fresh = adapted(policy.init(trial_key(state.key, state.trial, RESTART)), state.data)
         untrained = (state.trial <= first_search) & (first == 0)
+        worked = state.succeeded & (state.policy_trial > 0)  # a policy, and not random controls
         given = state.policy.params  # one that has learned keeps the inputs that it has learned with
         if not begun:
             given = optax.tree.where(untrained, adapted(given, state.data), given)
@@ -259,6 +262,7 @@ def experiment(
             earlier=jnp.maximum(state.trial - first_search, 0),
             steps=steps,
             fresh=fresh,
+            **({"second": worked} if refine_successes else {}),
         )
         return state._replace(policy=learner), info
 

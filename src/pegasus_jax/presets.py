@@ -37,7 +37,8 @@ CARTPOLE = Config(
     task="cartpole",
     model=Lagrangian(substeps=_SUBSTEPS["cartpole"]),
     fit=Fit(steps=3000, learning_rate=3e-3),
-    search=Search(cost_width_start=2.0, standardized_noise=True, refine_fraction=0.5),  # docs/decisions/0014 and 0015
+    # docs/decisions/0014, 0015 and 0029.
+    search=Search(particles=50, cost_width_start=2.0, standardized_noise=True, refine_fraction=0.5),
 )
 
 # docs/decisions/0006, 0008, 0009 and 0011.
@@ -108,7 +109,9 @@ _SWIMMERS = {
 
 # With a Bayesian neural network as the paper has it: what `model=` and the paper's algorithms change.
 NETWORKS: dict[str, Config] = {
-    "cartpole_network": replace(CARTPOLE, model=BNN(), fit=Fit()),
+    "cartpole_network": replace(
+        CARTPOLE, model=BNN(), fit=Fit(), search=replace(CARTPOLE.search, particles=Search.particles)
+    ),
     "double_cartpole_network": DOUBLE_CARTPOLE_NETWORK,
     **{
         f"{name}_network": replace(config, model=replace(config.model, ensemble_size=1, kl_weight=BNN.kl_weight))

@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 from pegasus_jax import config as settings
 from pegasus_jax import episode, tasks
 from pegasus_jax.assembly.pieces import dynamics_of, fit_of, policy_of
-from pegasus_jax.assembly.searchers import limits, search_of
+from pegasus_jax.assembly.searchers import limits, refines_successes, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.imagine import visited
@@ -83,6 +83,7 @@ def compose(
         explore=explore_of(config.explore, task),
         explore_trials=config.explore.trials,
         first_search=settings.first_search(config) if task.prior is None else config.explore.trials,
+        refine_successes=searcher is None and refines_successes(config.search),
         begun=settings.begins_with_policy(config),
         compare=config.successor == "better",
         capacity=config.trials * task.horizon + logged,

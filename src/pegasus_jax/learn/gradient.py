@@ -18,6 +18,7 @@ class SearchInfo(NamedTuple):
     objective: Array  # [steps]; where an iteration ends with a comparison, that of the policy that goes on
     gradient_norm: Array  # [steps] before clipping
     skipped: Array  # [] updates skipped because a gradient was not finite
+    iterations: Array | None = None  # [] how many were done; the rest are NaN; None: all
 
 
 def gradient_search(

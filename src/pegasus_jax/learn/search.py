@@ -10,7 +10,7 @@ import optax
 
 from pegasus_jax.imagine.scenarios import Sampler
 from pegasus_jax.learn.gradient import SearchInfo
-from pegasus_jax.learn.schedule import FRESH, STEP, SearchTable, first_rows
+from pegasus_jax.learn.schedule import FRESH, STEP, SearchTable, joined
 from pegasus_jax.learn.visits import Ascend, after, begun, valued
 from pegasus_jax.types import Array, Key, Params, PolicyOptimizer, TrainState
 
@@ -32,6 +32,7 @@ class Problem(NamedTuple):
     sampler: Sampler
     optimizer: optax.GradientTransformation  # any of optax
     table: SearchTable
+    second: SearchTable | None = None  # of the searches that are called with second=True; None: the same table
     reset_optimizer: bool = True  # whether each search starts with a new optimizer state
     # What a constraint makes of its multiplier; None: there is none. With it the objective's last argument is the
     # multiplier, and it returns (value, probability).
@@ -58,21 +59,24 @@ def search(
     first: Array | int = 0,
     earlier: Array | int = 0,
     fresh: Params | None = None,
+    second: Array | bool = False,
 ) -> tuple[TrainState, SearchInfo]:
     """The rows of iterations first .. first + steps - 1 of the problem's table, in the search after `earlier` others.
 
+    With `second` they are those of the problem's second table, as far as it goes; the rest of the info is NaN.
     One call of n steps and two calls of n/2, the second with first=n/2, do the same. `fresh` is the policy that a table
     may have as a candidate. All rows visit one objective: a second one would take as long again to compile. Raises
     ValueError for more iterations than the table has, and where its fresh policy is missing.
     """
-    table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)
-    if steps > (most := len(begin) - 1):
+    sampler, (table, following, begins, iterations) = problem.sampler, joined(problem.table, problem.second)
+    if steps > (most := begins.shape[1] - 1):
         raise ValueError(f"steps={steps}: the table of this search has {most}")
     if (asks := FRESH in table.candidate) and fresh is None:  # one that no row asks for is not drawn
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
     rows = of_search(table, earlier)
-    following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
-    row, end = (jnp.asarray(begin)[i] for i in (first, first + steps))
+    which = jnp.asarray(second, int)
+    begin, following = jnp.asarray(begins)[which], jnp.asarray(following)
+    row, end = (begin[i] for i in (first, first + steps))
     count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
 
     def visit(k: Array, loop: tuple) -> tuple:
@@ -94,7 +98,8 @@ def search(
     learner = TrainState(params, optax.tree.where(begins, new, state))
     scenarios, none = sampler.draw(key, jnp.asarray(first, jnp.int32), posterior), jnp.full(steps, jnp.nan)
     learner, _, info = jax.lax.fori_loop(0, count, visit, (learner, scenarios, SearchInfo(none, none, jnp.int32(0))))
-    return learner, info
+    done = jnp.clip(jnp.asarray(iterations, jnp.int32)[which] - first, 0, steps)
+    return learner, info._replace(iterations=done)
 
 
 def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:

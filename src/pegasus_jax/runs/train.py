@@ -20,6 +20,7 @@ from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config, begins_with_policy, first_search
 from pegasus_jax.experiment import EVALUATE, trial_key
 from pegasus_jax.learn.fit import FitInfo
+from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.logs.read import Logged
 from pegasus_jax.runs import begin, checkpoint, config_io, logged, restore, store, writers
 from pegasus_jax.runs.collect import collected, stacked
@@ -40,6 +41,7 @@ UNKNOWN: dict[str, Any] = {
     "objective_incumbent": None,
     "replaced": None,
     "gradient_norm": None,
+    "iterations": 0,
     "skipped_updates": 0,
 }
 
@@ -216,7 +218,7 @@ def improved(
         job.writer.problem(f"trial {trial}: the loss of the model's fit is {loss}, so nothing was learned")
     found = []
     for i in range(program.chunks):
-        cost = np.mean(found[-1].objective[:, -1]) if found else None
+        cost = np.mean(last(found)) if found else None
         phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)
         states, searched = program("search", states, jnp.int32(i * program.chunk))
         found.append(jax.tree.map(np.asarray, gather(searched)))
@@ -227,6 +229,7 @@ def improved(
     if not np.any(np.isfinite(objective) & np.isfinite(norm)):
         lost = "the imagined cost or its gradient is not finite in any iteration"
         job.writer.problem(f"trial {trial}: {lost}, so nothing was learned")
+    reached, done = last(found), iterations(found)
     skipped = fitted.skipped + sum(f.skipped for f in found)
     states, successor = program("succeed", states, incumbents, purpose="imagine")
     successor = gather(successor)
@@ -235,16 +238,28 @@ def improved(
         {
             "fit_loss": float(fitted.loss[index]),
             "objective_first": float(objective[index, 0]),
-            "objective_last": float(objective[index, -1]),
+            "objective_last": float(reached[index]),
             "objective_fresh": float(jnp.mean(successor.cost[index])),
             "objective_incumbent": known(successor.incumbent[index]),
             "replaced": bool(successor.replaced[index]),
-            "gradient_norm": float(np.median(norm[index])),
+            "gradient_norm": float(np.median(norm[index, : done[index]])),
+            "iterations": int(done[index]),
             "skipped_updates": int(skipped[index]),
             **({} if successor.chance is None else {"constraint_expected": float(successor.chance[index])}),
         }
         for index in range(len(skipped))
     ]
+
+
+def iterations(found: Sequence[SearchInfo]) -> np.ndarray:
+    """How many iterations of a search the seeds [S] have done, of which `found` are the parts."""
+    return np.sum([f.objective.shape[1] + 0 * f.skipped if f.iterations is None else f.iterations for f in found], 0)
+
+
+def last(found: Sequence[SearchInfo]) -> np.ndarray:
+    """The objective of the last iteration that the seeds [S] have done."""
+    objective = np.concatenate([f.objective for f in found], 1)
+    return np.take_along_axis(objective, iterations(found)[:, None] - 1, 1)[:, 0]
 
 
 def known(value: Any) -> float | None:
