@@ -129,7 +129,9 @@ def search_of(
     clip = optax.identity() if search.grad_clip is None else optax.clip_by_global_norm(search.grad_clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
     draws = scenarios.sampler(searched, Period(**vars(search.period)))
-    found = searcher(Problem(value, draws, optimizer, table, second, search.reset_optimizer, ascend))
+    found = searcher(
+        Problem(value, draws, optimizer, table, second, reset_optimizer=search.reset_optimizer, ascend=ascend)
+    )
     if search.num_starts > 1:
         lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
         # What refines may end with another than its last.

@@ -33,6 +33,7 @@ class Problem(NamedTuple):
     optimizer: optax.GradientTransformation  # any of optax
     table: SearchTable
     second: SearchTable | None = None  # of the searches that are called with second=True; None: the same table
+    follows_second: Array | bool = False  # [] whether this search is one of them
     reset_optimizer: bool = True  # whether each search starts with a new optimizer state
     # What a constraint makes of its multiplier; None: there is none. With it the objective's last argument is the
     # multiplier, and it returns (value, probability).
@@ -46,7 +47,10 @@ def searcher(problem: Problem) -> PolicyOptimizer:
         none = jnp.asarray(jnp.inf, float), jnp.zeros((), bool), begun(problem.ascend)
         return SearchState(problem.optimizer.init(params), params, *none)
 
-    return PolicyOptimizer(init, partial(search, problem=problem))
+    def run(*given: Any, second: Array | bool = False, **where: Any) -> tuple[TrainState, SearchInfo]:
+        return search(*given, problem=problem._replace(follows_second=second), **where)
+
+    return PolicyOptimizer(init, run)
 
 
 def search(
@@ -59,11 +63,10 @@ def search(
     first: Array | int = 0,
     earlier: Array | int = 0,
     fresh: Params | None = None,
-    second: Array | bool = False,
 ) -> tuple[TrainState, SearchInfo]:
     """The rows of iterations first .. first + steps - 1 of the problem's table, in the search after `earlier` others.
 
-    With `second` they are those of the problem's second table, as far as it goes; the rest of the info is NaN.
+    Those that it lacks, where it follows its second table, are NaN in the info.
     One call of n steps and two calls of n/2, the second with first=n/2, do the same. `fresh` is the policy that a table
     may have as a candidate. All rows visit one objective: a second one would take as long again to compile. Raises
     ValueError for more iterations than the table has, and where its fresh policy is missing.
@@ -74,7 +77,7 @@ def search(
     if (asks := FRESH in table.candidate) and fresh is None:  # one that no row asks for is not drawn
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
     rows = of_search(table, earlier)
-    which = jnp.asarray(second, int)
+    which = jnp.asarray(problem.follows_second, int)
     begin, following = jnp.asarray(begins)[which], jnp.asarray(following)
     row, end = (begin[i] for i in (first, first + steps))
     count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
