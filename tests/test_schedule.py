@@ -9,19 +9,7 @@ import numpy as np
 import pytest
 
 from pegasus_jax.imagine.objective import either
-from pegasus_jax.learn.schedule import (
-    COARSE,
-    CURRENT,
-    EVALUATE,
-    FRESH,
-    START,
-    STEP,
-    SearchTable,
-    first_rows,
-    joined,
-    refining_table,
-    search_table,
-)
+from pegasus_jax.learn.schedule import COARSE, CURRENT, EVALUATE, FRESH, START, STEP, first_rows, search_table
 from pegasus_jax.viz.search_table import text
 
 
@@ -123,29 +111,6 @@ def test_a_table_can_be_read_without_jax():
     ]
     later = search_table(2, decay=0.5, anneal_trials=2)
     assert text(later, 9) == text(later, 2) != text(later, 0)
-
-
-def test_a_refinement_alone_follows_the_last_part_of_a_whole_search():
-    """Each of its iterations refines, from the whole step size to its end; then what it was given is compared."""
-    alone, whole = refining_table(5), search_table(10, refine=5)
-    assert alone.refine.all()
-    np.testing.assert_allclose(alone.step_size[0], whole.step_size[0, -len(alone.iteration) :])
-    assert alone.candidate.tolist() == 6 * [CURRENT] + [COARSE]
-    assert alone.action.tolist() == 5 * [STEP] + 2 * [EVALUATE]
-
-
-def test_two_tables_are_one_whose_rows_keep_their_scenarios():
-    first, second = search_table(4, decay=0.5, anneal_trials=3), refining_table(2)
-    table, following, begins, iterations = joined(first, second)
-    assert iterations.tolist() == [4, 2]
-    for one, begin in zip((first, second), begins, strict=True):
-        rows = np.arange(begin[0], begin[-1])
-        for name in SearchTable._fields[:5]:
-            assert np.array_equal(getattr(table, name)[rows], getattr(one, name))
-        assert np.array_equal(table.step_size[-1, rows], one.step_size[-1])
-        assert np.array_equal(following[rows[:-1]], one.scenarios[1:])
-        assert following[rows[-1]] == one.scenarios[-1] + 1
-    assert begins[1, 2] == begins[1, 4]  # an iteration that a table does not have has no rows
 
 
 @pytest.mark.parametrize(("asked", "slope"), [(True, 2.0), (False, np.inf)])

@@ -17,7 +17,7 @@ from pegasus_jax.imagine.objective import either, objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
 from pegasus_jax.imagine.visited import beside_visited, started
 from pegasus_jax.learn.multistart import best_of
-from pegasus_jax.learn.schedule import SearchTable, refining_table, search_table
+from pegasus_jax.learn.schedule import SearchTable, search_table
 from pegasus_jax.learn.search import Problem, searcher
 from pegasus_jax.memory import begin, steps
 from pegasus_jax.pilco import search as pilco
@@ -108,7 +108,6 @@ def search_of(
     match = matching_of(search, task).particles(task.angles)
     costs = costs_of(search, task)
     table = table_of(search)
-    second = refining_table(refining_steps(search)) if refines_successes(search) else None
     # What no row asks for is not compiled.
     refines, widens = table.refine.any(), (table.cost_width != 1).any()
 
@@ -129,9 +128,7 @@ def search_of(
     clip = optax.identity() if search.grad_clip is None else optax.clip_by_global_norm(search.grad_clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
     draws = scenarios.sampler(searched, Period(**vars(search.period)))
-    found = searcher(
-        Problem(value, draws, optimizer, table, second, reset_optimizer=search.reset_optimizer, ascend=ascend)
-    )
+    found = searcher(Problem(value, draws, optimizer, table, reset_optimizer=search.reset_optimizer, ascend=ascend))
     if search.num_starts > 1:
         lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
         # What refines may end with another than its last.
@@ -154,11 +151,10 @@ def matching_of(search: settings.Search, task: Task) -> Matching:
 
 def table_of(search: settings.Search) -> SearchTable:
     """What the configured search does, visit by visit."""
-    last = refining_steps(search)
     return search_table(
         search.steps,
         init="previous" if search.num_starts > 1 else search.init,  # of several, others are fresh
-        refine=search.steps - last if last else None,
+        refine=round((1 - search.refine_fraction) * search.steps) if search.refine_fraction else None,
         cost_width_start=search.cost_width_start,
         decay=search.decay,
         anneal_trials=search.anneal_trials,
@@ -167,14 +163,9 @@ def table_of(search: settings.Search) -> SearchTable:
     )
 
 
-def refining_steps(search: settings.Search) -> int:
-    """The iterations of the last part of a search, in which it refines."""
-    return search.steps - round((1 - search.refine_fraction) * search.steps)
-
-
 def refines_successes(search: settings.Search | settings.Analytic) -> bool:
-    """Whether the search after an episode that succeeded is that last part alone: several policies need the first."""
-    return isinstance(search, settings.Search) and search.num_starts == 1 and refining_steps(search) > 0
+    """Whether the search after an episode that succeeded only refines: several policies need all of it."""
+    return isinstance(search, settings.Search) and search.num_starts == 1 and bool(table_of(search).refine.any())
 
 
 def analytic_search_of(

@@ -74,38 +74,6 @@ def search_table(
     return SearchTable(iteration, scenarios, action, candidate, refines, width, step_size, limit)
 
 
-def refining_table(steps: int) -> SearchTable:
-    """The table of a search that only refines the policy that it is given: after an episode that succeeded."""
-    return search_table(steps, refine=0)
-
-
-class Tables(NamedTuple):
-    """One table or two as the rows of one, so that which of them a search follows is data."""
-
-    table: SearchTable  # [T, R] of the first, then of the second
-    following: np.ndarray  # [R] the iteration whose scenarios come after a row: no key is drawn from twice
-    first_rows: np.ndarray  # [2, N+1] the row with which each iteration of either begins, and the one after its last
-    iterations: np.ndarray  # [2] how many either has
-
-
-def joined(table: SearchTable, second: SearchTable | None = None) -> Tables:
-    """A table of N iterations, and a `second` of at most as many; without it, both are the first."""
-    begins = first_rows(table)
-    if second is None:
-        return Tables(table, _following(table), np.stack([begins, begins]), np.array(2 * [len(begins) - 1]))
-    others = first_rows(second) + len(table.iteration)
-    iterations = np.array([len(begins), len(others)]) - 1
-    others = np.pad(others, (0, len(begins) - len(others)), "edge")  # the iterations that it does not have: no rows
-    factors = [np.repeat(column[-1:], len(table.limit), 0) for column in second[-3:]]
-    rows = [np.concatenate(of, -1) for of in zip(table, (*second[:-3], *factors), strict=True)]
-    following = np.concatenate([_following(table), _following(second)])
-    return Tables(SearchTable(*rows), following, np.stack([begins, others]), iterations)
-
-
-def _following(table: SearchTable) -> np.ndarray:
-    return np.append(table.scenarios[1:], table.scenarios[-1:] + 1)
-
-
 def half_cosine(fraction: Any, decay: float) -> np.ndarray:
     """A factor that falls from 1 to `decay` as the fraction goes from 0 to 1, and stays there."""
     return (1 - decay) * (1 + np.cos(np.pi * np.minimum(fraction, 1))) / 2 + decay

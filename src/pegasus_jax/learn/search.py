@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from pegasus_jax.imagine.scenarios import Sampler
 from pegasus_jax.learn.gradient import SearchInfo
-from pegasus_jax.learn.schedule import FRESH, STEP, SearchTable, joined
+from pegasus_jax.learn.schedule import FRESH, STEP, SearchTable, first_rows
 from pegasus_jax.learn.visits import Ascend, after, begun, valued
 from pegasus_jax.types import Array, Key, Params, PolicyOptimizer, TrainState
 
@@ -32,8 +33,7 @@ class Problem(NamedTuple):
     sampler: Sampler
     optimizer: optax.GradientTransformation  # any of optax
     table: SearchTable
-    second: SearchTable | None = None  # of the searches that are called with second=True; None: the same table
-    follows_second: Array | bool = False  # [] whether this search is one of them
+    only_refines: Array | bool = False  # [] whether a search skips all iterations before those that refine
     reset_optimizer: bool = True  # whether each search starts with a new optimizer state
     # What a constraint makes of its multiplier; None: there is none. With it the objective's last argument is the
     # multiplier, and it returns (value, probability).
@@ -47,8 +47,8 @@ def searcher(problem: Problem) -> PolicyOptimizer:
         none = jnp.asarray(jnp.inf, float), jnp.zeros((), bool), begun(problem.ascend)
         return SearchState(problem.optimizer.init(params), params, *none)
 
-    def run(*given: Any, second: Array | bool = False, **where: Any) -> tuple[TrainState, SearchInfo]:
-        return search(*given, problem=problem._replace(follows_second=second), **where)
+    def run(*given: Any, only_refines: Array | bool = False, **where: Any) -> tuple[TrainState, SearchInfo]:
+        return search(*given, problem=problem._replace(only_refines=only_refines), **where)
 
     return PolicyOptimizer(init, run)
 
@@ -66,20 +66,20 @@ def search(
 ) -> tuple[TrainState, SearchInfo]:
     """The rows of iterations first .. first + steps - 1 of the problem's table, in the search after `earlier` others.
 
-    Those that it lacks, where it follows its second table, are NaN in the info.
-    One call of n steps and two calls of n/2, the second with first=n/2, do the same. `fresh` is the policy that a table
-    may have as a candidate. All rows visit one objective: a second one would take as long again to compile. Raises
+    A search that only refines begins at the first that does, as 0; those that it lacks are NaN in the info. One call
+    of n steps and two of n/2, the second with first=n/2, do the same. `fresh` is a policy that the table may ask for.
+    All rows visit one objective: a second one would take as long again to compile. Raises
     ValueError for more iterations than the table has, and where its fresh policy is missing.
     """
-    sampler, (table, following, begins, iterations) = problem.sampler, joined(problem.table, problem.second)
-    if steps > (most := begins.shape[1] - 1):
+    table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)
+    if steps > (most := len(begin) - 1):
         raise ValueError(f"steps={steps}: the table of this search has {most}")
     if (asks := FRESH in table.candidate) and fresh is None:  # one that no row asks for is not drawn
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
     rows = of_search(table, earlier)
-    which = jnp.asarray(problem.follows_second, int)
-    begin, following = jnp.asarray(begins)[which], jnp.asarray(following)
-    row, end = (begin[i] for i in (first, first + steps))
+    following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
+    begun = first + jnp.where(problem.only_refines, np.sum(~table.refine[begin[:-1]]), 0)
+    row, end = (jnp.asarray(begin)[jnp.minimum(i, most)] for i in (begun, begun + steps))
     count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
 
     def visit(k: Array, loop: tuple) -> tuple:
@@ -89,7 +89,7 @@ def search(
         visited = jax.tree.map(choose, own, fresh if asks else own, state.start, state.start)
         value, gradient, weight = valued(problem, state.multiplier, visited, posterior, scenarios, now)
         learner, cost, skipped = after(now, learner, visited, value, gradient, weight, problem)
-        i = now.iteration - first
+        i = now.iteration - begun
         stepped = jnp.where(now.action == STEP, i, steps)
         norms = info.gradient_norm.at[stepped].set(optax.tree.norm(gradient), mode="drop")
         scenarios = sampler.redraw(key, following[row + k], scenarios, posterior)
@@ -99,10 +99,9 @@ def search(
     optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
     begins, new = jnp.asarray(first) == 0, state._replace(optimizer=optimizer, start=params)
     learner = TrainState(params, optax.tree.where(begins, new, state))
-    scenarios, none = sampler.draw(key, jnp.asarray(first, jnp.int32), posterior), jnp.full(steps, jnp.nan)
+    scenarios, none = sampler.draw(key, jnp.asarray(begun, jnp.int32), posterior), jnp.full(steps, jnp.nan)
     learner, _, info = jax.lax.fori_loop(0, count, visit, (learner, scenarios, SearchInfo(none, none, jnp.int32(0))))
-    done = jnp.clip(jnp.asarray(iterations, jnp.int32)[which] - first, 0, steps)
-    return learner, info._replace(iterations=done)
+    return learner, info._replace(iterations=jnp.clip(most - begun, 0, steps))
 
 
 def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
