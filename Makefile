@@ -73,9 +73,15 @@ $(BIN)/python:
 	@$(PYTHON) -c 'import ensurepip' 2>/dev/null && $(PYTHON) -m venv $(VENV) || \
 	  { $(PYTHON) -m venv --without-pip $(VENV) && $(PYTHON) -m pip --python $(VENV)/bin/python install --quiet pip; }
 
-# Two commands because pip refuses an editable install in hash mode; the build backend, hatchling, is in the lock.
+# uv installs in a tenth of pip's time; it comes from the lock too. It does not read pip's settings: where they name the
+# only index that can be reached, pip installs. The project itself is a second command, because an editable install has
+# no hash; its build backend, hatchling, is in the lock.
+LOCKED  = pip install -qq --require-hashes -r requirements.lock
+PROJECT = pip install -qq --no-deps --no-build-isolation --editable .
 $(STAMP): requirements.lock pyproject.toml | $(BIN)/python
-	@echo 'installing requirements.lock into $(VENV) (about a minute and 1.5 GB)'
-	@$(BIN)/python -m pip install -qq --require-hashes -r requirements.lock
-	@$(BIN)/python -m pip install -qq --no-deps --no-build-isolation --editable .
+	@echo 'installing requirements.lock into $(VENV) (half a minute and 1.5 GB)'
+	@awk '/^uv==/, !/\\$$/' requirements.lock > $(VENV)/uv.txt
+	@$(BIN)/python -m pip install -qq --require-hashes -r $(VENV)/uv.txt
+	@VIRTUAL_ENV=$(VENV) $(BIN)/uv $(LOCKED) || $(BIN)/python -m $(LOCKED)
+	@VIRTUAL_ENV=$(VENV) $(BIN)/uv $(PROJECT) || $(BIN)/python -m $(PROJECT)
 	@touch $@
