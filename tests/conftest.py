@@ -1,7 +1,9 @@
 """What every test shares: key reuse is an error, property tests are repeatable, and float64 is one fixture away."""
 
+import gc
 import os
 from importlib.metadata import version
+from pathlib import Path
 
 # Before jax loads LAPACK: two test processes on two cores, each with a thread a core that spins while it waits, made a
 # Cholesky factor of 375 rows take a second instead of a millisecond.
@@ -14,6 +16,11 @@ os.environ["XLA_FLAGS"] = " ".join(
     ["--xla_cpu_use_fusion_emitters=false"] * (version("jaxlib") < "0.11") + os.environ.get("XLA_FLAGS", "").split()
 )
 
+# A program is compiled once for all tests and the processes that they start, in this run of them and in the next ones:
+# many compile the same, small ones above all. `make clean` removes the folder.
+os.environ["JAX_COMPILATION_CACHE_DIR"] = str(Path(__file__).resolve().parents[1] / "build" / "programs")
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+
 import jax
 import pytest
 from hypothesis import settings
@@ -21,6 +28,9 @@ from hypothesis import settings
 # A random key used twice raises, in jit and scan too: PEGASUS rests on knowing which draw is which. One false alarm is
 # known, in jax 0.10 and 0.12: vmap of a scan over split keys. probes.unchecked switches the check off for that.
 jax.config.update("jax_debug_key_reuse", True)
+
+# JAX makes many objects when it traces, and few of them are garbage: a tenth of a test's time went to look for it.
+gc.set_threshold(100_000, 50, 100)
 
 # Derandomized: a failure in CI is the same failure here. No deadline: the first example compiles.
 settings.register_profile("repository", deadline=None, derandomize=True, max_examples=25)

@@ -47,7 +47,8 @@ def test_a_user_without_a_home_has_none(monkeypatch: pytest.MonkeyPatch) -> None
     main._remember_compilations()
 
 
-def test_an_open_folder_is_named_and_the_command_goes_on(tmp_path: Path) -> None:
+def test_an_open_folder_is_named_and_the_command_goes_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
     (tmp_path / "pegasus_jax").mkdir()
     (tmp_path / "pegasus_jax").chmod(0o777)
     done = call("evaluate", "nowhere", cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path))
