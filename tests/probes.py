@@ -103,6 +103,10 @@ def dial(horizon: int = 6) -> Task:
     )
 
 
+# Of a search that neither restarts nor refines, for those who ask nothing of that: it compiles in half the time.
+PLAIN = dict(search__init="previous", search__refine_fraction=0.0)
+
+
 class Counter:
     """How often Python went through a function: once a trace."""
 

@@ -39,7 +39,7 @@ CONFIG = pg.Config(
     model=pg.config.BNN(hidden=(4,)),
     policy=pg.config.MLP(hidden=(4,)),
     fit=pg.config.Fit(steps=3, batch_size=4),
-    search=pg.config.Search(steps=2, particles=K),
+    search=pg.config.Search(steps=2, particles=K, init="previous", refine_fraction=0),
 )
 
 

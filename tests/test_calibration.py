@@ -10,7 +10,7 @@ import pytest
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.models.calibration import calibration
 from pegasus_jax.types import Dynamics, Prediction, Trajectory
-from probes import PENDULUM, cart, experience, known, network, noisy_linear_policy, regression, same, tiny
+from probes import PENDULUM, PLAIN, cart, experience, known, network, noisy_linear_policy, regression, same, tiny
 
 STEPS, STATES = 400, 2
 
@@ -75,7 +75,7 @@ def test_few_draws_say_nearly_the_same():
 def test_of_an_experiment_it_is_unknown_before_there_are_data_and_changes_nothing():
     task = cart()
     exp = compose(
-        tiny(fit__steps=5, search__steps=2), task, dynamics=regression(2, 1), policy=noisy_linear_policy(task)
+        tiny(fit__steps=5, search__steps=2, **PLAIN), task, dynamics=regression(2, 1), policy=noisy_linear_policy(task)
     )
     state = exp.init(jax.random.key(0))
     collect, add_episode, calibrate = (jax.jit(f) for f in (exp.collect, exp.add_episode, exp.calibrate))

@@ -30,7 +30,7 @@ from pegasus_jax.runs.evaluation import evaluate_run
 from pegasus_jax.runs.train import train
 from pegasus_jax.tasks import circled
 from pegasus_jax.types import Cost
-from probes import cart, dial, tiny
+from probes import PLAIN, cart, dial, tiny
 
 PAIRS = st.permutations(range(7)).flatmap(
     lambda order: st.integers(0, 3).map(lambda count: tuple((order[2 * i], order[2 * i + 1]) for i in range(count)))
@@ -159,7 +159,7 @@ def test_starts_that_hang_are_not_torn_at_the_seam() -> None:
 
 
 def learned(folder: Path, env: str, cost: str, **given: Any) -> Path:
-    config = tiny(trials=2, search__steps=5, search__cost_width_start=1.0, fit__steps=20, eval_episodes=2)
+    config = tiny(trials=2, search__steps=5, search__cost_width_start=1.0, fit__steps=20, eval_episodes=2, **PLAIN)
     config = replace(config, task="gym", env=env, cost=f"{__name__}:{cost}", horizon=6, **given)
     known = tasks.resolve(config)
     train(known, store.create(folder))

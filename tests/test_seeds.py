@@ -19,7 +19,7 @@ import pytest
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.runs import machine, programs, store
 from pegasus_jax.runs.programs import Program, over_seeds
-from probes import EMITTERS, cart, tiny, unchecked
+from probes import EMITTERS, PLAIN, cart, tiny, unchecked
 from test_train import TINY, call, fingerprint, program
 
 # Fitted for longer: under a model that has hardly been, every policy costs 1, and Adam follows a gradient's rounding.
@@ -78,6 +78,7 @@ def test_evaluation_episodes_cost_the_same_side_by_side() -> None:
 
 def test_the_options_of_another_compiler_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     """JAX's versions differ in them, and one that is unknown would end a run before its first episode."""
+    monkeypatch.delenv("XLA_FLAGS", raising=False)  # of these tests, which speaks of the options too
     other: Any = {"xla_of_another_version": True}
     with pytest.raises(jax.errors.JaxRuntimeError, match="xla_of_another_version"):
         jax.jit(jnp.sin).lower(0.0).compile(compiler_options=other)
@@ -101,8 +102,10 @@ def test_a_gpu_is_told_how_to_run_loops_unless_the_user_says(monkeypatch: pytest
 
 
 @pytest.mark.slow
-def test_how_it_is_compiled_changes_no_result() -> None:
+def test_how_it_is_compiled_changes_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """Graphs of kernels where these tests run on a GPU, wide vectors on a CPU. A few steps: rounding grows."""
+    monkeypatch.delenv("XLA_FLAGS", raising=False)  # or the options that it speaks of would be left out
+    assert not programs.FAST_RUN[jax.default_backend()].keys() - programs.compiler_options(programs.FAST_RUN).keys()
     experiment = compose(tiny(), cart())
     given = experiment.add_episode(state := experiment.init(jax.random.key(0)), experiment.collect(state))
     for part in (partial(experiment.fit, steps=10), partial(experiment.search, steps=5)):
@@ -236,7 +239,7 @@ def test_one_environment_on_the_host_has_one_seed(tmp_path: Path) -> None:
 
 def test_a_seed_that_diverges_leaves_the_others_as_they_are() -> None:
     """One seed's data turns to NaN: its own updates are skipped, the other's parameters are bit-equal."""
-    exp = compose(tiny(trials=1, fit__steps=5, search__steps=5), cart())
+    exp = compose(tiny(trials=1, fit__steps=5, search__steps=5, **PLAIN), cart())
     over = jax.jit(over_seeds(exp.init, (0,), seeds=2)), jax.jit(over_seeds(exp.improve, (0,), seeds=2))
     init, improve = map(unchecked, over)
     states = init(jnp.stack([jax.random.key(0), jax.random.key(1)]))

@@ -25,7 +25,7 @@ from pegasus_jax.runs.controller import controller
 from pegasus_jax.tasks.remembered import polynomials, remembering, smoothed
 from pegasus_jax.tasks.sensed import sensed
 from pegasus_jax.types import Batch, Dataset, Dynamics, Prediction, Scenarios
-from probes import cart, linear_policy, tiny
+from probes import PLAIN, cart, linear_policy, tiny
 
 H, DT = 8, 0.3
 A, B = np.array([[1, DT], [0, 1]]), np.array([DT**2 / 2, DT])  # the probe's cart
@@ -247,7 +247,9 @@ def test_an_environment_gets_rates_as_a_robot_computes_them():
     task = tasks.of_config(tasks.resolve(config))
     assert (task.state_names, task.rates) == (("x1", "rate of x1"), (1,))
     np.testing.assert_array_equal(task.start_mean, [1, 0])
-    config = tiny(sensors=config.sensors, search__steps=2, search__cost_width_start=1.0, fit__steps=2, trials=2)
+    config = tiny(
+        sensors=config.sensors, search__steps=2, search__cost_width_start=1.0, fit__steps=2, trials=2, **PLAIN
+    )
     exp = compose(config, task)
     state = exp.init(jax.random.key(0))
     ran = exp.collect(state)

@@ -20,10 +20,10 @@ from pegasus_jax.runs.study import one_json, rounded
 from pegasus_jax.runs.train import learn
 from pegasus_jax.runs.writers import Writer
 from pegasus_jax.types import RunState, Trajectory
-from probes import cart, same, tiny, unchecked
+from probes import PLAIN, cart, same, tiny, unchecked
 
 SEEDS, TRIALS = [5, 6], 2
-CONFIG = tiny(trials=TRIALS, eval_episodes=3, fit__steps=20, search__steps=10)
+CONFIG = tiny(trials=TRIALS, eval_episodes=3, fit__steps=20, search__steps=10, **PLAIN)
 
 
 @pytest.fixture(scope="module")

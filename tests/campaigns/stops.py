@@ -108,7 +108,8 @@ def started(case: Case, folder: Path, fails: int) -> subprocess.Popen[str]:
     """pegasus-train in `folder`; a cold cache where it should compile for long."""
     told = {**os.environ, "ROBOT_LOG": str(folder / "robot.log"), "ROBOT_FAILS": str(fails)}
     if case.moment == "compile":
-        told |= {"JAX_COMPILATION_CACHE_DIR": str(folder / "cache"), "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
+        told |= {"JAX_COMPILATION_CACHE_DIR": str(folder / "cache"), "XLA_FLAGS": ""}
+        told["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "0"
     program = [
         sys.executable,
         "-P",
