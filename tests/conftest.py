@@ -12,9 +12,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # take the place of a run's own options (programs.FAST_RUN) and save a third of its time; later compilers have some of
 # them no more, and end a process that is given those.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
-FASTER = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0 --xla_cpu_prefer_vector_width=256"
 os.environ["XLA_FLAGS"] = " ".join(
-    FASTER.split() * (version("jaxlib") < "0.11") + os.environ.get("XLA_FLAGS", "").split()
+    ["--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=0", "--xla_cpu_prefer_vector_width=256"]
+    * (version("jaxlib") < "0.11")
+    + os.environ.get("XLA_FLAGS", "").split()
 )
 
 # A program is compiled once for all tests and the processes that they start, in this run of them and in the next ones:

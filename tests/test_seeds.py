@@ -7,6 +7,7 @@ import socket
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,14 @@ from test_train import TINY, call, fingerprint, program
 
 # Fitted for longer: under a model that has hardly been, every policy costs 1, and Adam follows a gradient's rounding.
 WORDS = [*TINY, "trials=2", "seed=1", "fit.steps=400"]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled_well() -> Iterator[None]:
+    """A run's own options, as a user has them: without them rounding differs too much between one device and two."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XLA_FLAGS", "--xla_cpu_use_fusion_emitters=false" if EMITTERS else "")
+        yield
 
 
 @pytest.fixture(scope="module")

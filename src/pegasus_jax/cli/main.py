@@ -59,9 +59,8 @@ def main(
     `always` are words that come after those that were typed, if any were.
     Whatever ends it, a robot is let go first, and no thread that still compiles is waited for.
     """
-    gc.set_threshold(
-        100_000
-    )  # JAX's tracing makes much that stays: to search it 100 times as often took a tenth longer
+    # What JAX makes when it traces stays: to look for garbage in it so often took a tenth of a short run's time.
+    gc.set_threshold(100_000)
     words = sys.argv[1:]
     interrupt.before_end(_let_robots_go)
     try:
