@@ -54,14 +54,13 @@ def figures(folder: Path, out: Path) -> str:
 
 
 def section(figure: Figure, out: Path) -> str:
-    """One figure: what the paper says, the picture if it has been drawn, the studies, the claims, the commands."""
+    """One figure: what the paper says, the picture if it has been drawn, the studies, the claims."""
     parts = [f"\n## {figure.title}", f"**Paper.** {figure.paper}"]
     if figure.found:
         parts.append(f"**Here.** {figure.found}")
     if (out / f"{figure.name}.png").exists():
         parts.append(f"![{figure.title}]({os.path.relpath(out / f'{figure.name}.png', PAGE.parent)})")
     parts += [claims.markdown(claims.variants_table(figure, out)), claims.markdown(claims.claims_table(figure, out))]
-    parts.append(f"`make figures FIGURE={figure.name}` runs what is missing.")
     return "\n\n".join(parts) + "\n"
 
 

@@ -175,7 +175,7 @@ def test_a_variant_brings_defaults_that_single_settings_change():
 
 @pytest.mark.parametrize("words", [("task=gym", "env=Pendulum-v1"), ("task=mjcf", "mjcf=arm.xml")])
 def test_a_cost_of_ones_own_is_matched_and_not_widened(words):
-    """docs/decisions/0018; the paper's search follows each particle's, on every task."""
+    """docs/decisions.md 0018; the paper's search follows each particle's, on every task."""
     chosen = parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9").search
     assert (chosen.cost_estimator, chosen.cost_width_start, chosen.standardized_noise, chosen.refine_fraction) == (
         "gaussian",
@@ -183,7 +183,7 @@ def test_a_cost_of_ones_own_is_matched_and_not_widened(words):
         True,
         0.5,
     )
-    assert (chosen.matching, chosen.visited_starts) == ("narrow", 0.5)  # docs/decisions/0023 and 0024
+    assert (chosen.matching, chosen.visited_starts) == ("narrow", 0.5)  # docs/decisions.md 0023 and 0024
     assert (
         parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9", "algorithm=paper").search.cost_estimator == "particles"
     )

@@ -26,8 +26,6 @@ class Judged(NamedTuple):
     """A claim with its numbers, as text, and a word."""
 
     claim: Claim
-    lower: str
-    than: str
     difference: str
     verdict: str
 
@@ -42,7 +40,7 @@ def test_claim(claim: Claim, figure: Figure, out: Path) -> Judged:
     first = costs(claim.lower, claim.trials, figure, out)
     second = costs(claim.than, claim.trials, figure, out) if isinstance(claim.than, str) else claim.than
     if first is None or second is None:
-        return Judged(claim, estimate(first), estimate(second), MISSING, MISSING)
+        return Judged(claim, MISSING, MISSING)
     if isinstance(second, Costs):
         low, high = interval(first.mean, second.mean, paired=first.seeds == second.seeds)
         neither = "no difference" if max(-low, high) <= SAME else "undecided"
@@ -52,7 +50,7 @@ def test_claim(claim: Claim, figure: Figure, out: Path) -> Judged:
         words, other = ("beats", "reaches", "misses"), second
     verdict = words[0] if high < 0 else words[2] if low > 0 else words[1]
     difference = f"{iqm(first.mean) - other:+.3f} [{low:+.3f}, {high:+.3f}]"
-    return Judged(claim, estimate(first), estimate(second), difference, verdict)
+    return Judged(claim, difference, verdict)
 
 
 def costs(variant: str, trials: tuple[int, int], figure: Figure, out: Path) -> Costs | None:
@@ -61,13 +59,6 @@ def costs(variant: str, trials: tuple[int, int], figure: Figure, out: Path) -> C
     if result is None or len(result["plant_seconds"]) < trials[1]:
         return None
     return Costs(result["seeds"], np.asarray(result["mean_cost"], float)[:, trials[0] - 1 : trials[1]].mean(1))
-
-
-def estimate(value: Costs | float | None) -> str:
-    """Interquartile mean over seeds and its interval; of a published number, itself."""
-    if value is None:
-        return MISSING
-    return middling(value.mean) if isinstance(value, Costs) else f"{value:g}"
 
 
 def middling(values: np.ndarray) -> str:
@@ -110,10 +101,9 @@ def claims_table(figure: Figure, out: Path) -> list[list[str]]:
         judged = test_claim(claim, figure, out)
         first, last = claim.trials
         span = f"trial {first}" if first == last else f"trials {first} to {last}"
-        than = claim.than if isinstance(claim.than, str) else "published"
-        sides = [f"{claim.lower}: {judged.lower}", f"{than}: {judged.than}"]
-        rows.append([claim.says, span, *sides, judged.difference, judged.verdict])
-    return [["claim", "mean cost of", "lower", "than", "difference", "verdict"], *rows]
+        than = claim.than if isinstance(claim.than, str) else f"published {claim.than:g}"
+        rows.append([claim.says, span, f"{claim.lower}, {than}", judged.difference, judged.verdict])
+    return [["claim", "mean cost of", "this, below that", "difference", "verdict"], *rows]
 
 
 def markdown(table: list[list[str]]) -> str:

@@ -12,7 +12,7 @@ def saturating(*errors: Array) -> Array:
 
 
 def pendulum(x: Array) -> Array:
-    """[cos, sin, rate], upright at 0: the cost of docs/extending.md."""
+    """[cos, sin, rate], upright at 0: the cost of docs/simulator.md."""
     return saturating((x[0] - 1) / 0.5, x[1] / 0.5)
 
 

@@ -1,7 +1,7 @@
 """Learn a neural-network controller from a few minutes of robot time.
 
 Everything here is a plain function or a plain value, to be jitted, vmapped and differentiated in your own code. What
-each name is for: docs/design.md, "Public names".
+each name is for: the API reference of the documentation, and `_NAMES`.
 """
 
 from importlib import import_module

@@ -374,7 +374,7 @@ def _unknown(like: jax.ShapeDtypeStruct) -> Array:
 
 
 def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunState, TrialInfo]:
-    """One round of Alg. 1: collect, add_episode, improve; then `episodes` evaluation episodes that are not data."""
+    """One round of Alg. 1: collect, add_episode, improve; then `episodes` more, whose costs [E, H] are not data."""
     trajectory = exp.collect(state)
     state = exp.add_episode(state, trajectory)
     state, (fitted, searched) = exp.improve(state)

@@ -30,18 +30,18 @@ from pegasus_jax.config import (
     Search,
 )
 
-# Of a mechanism's integration, where a task needs others than most: docs/decisions/0009.
+# Of a mechanism's integration, where a task needs others than most: docs/decisions.md 0009.
 _SUBSTEPS = {"cartpole": 1}  # its pole never turns fast enough for two to matter
 
 CARTPOLE = Config(
     task="cartpole",
     model=Lagrangian(substeps=_SUBSTEPS["cartpole"]),
     fit=Fit(steps=3000, learning_rate=3e-3),
-    # docs/decisions/0014, 0015 and 0029.
+    # docs/decisions.md 0014, 0015 and 0029.
     search=Search(particles=50, cost_width_start=2.0, standardized_noise=True, refine_fraction=0.5),
 )
 
-# docs/decisions/0006, 0008, 0009 and 0011.
+# docs/decisions.md 0006, 0008, 0009 and 0011.
 DOUBLE_CARTPOLE = Config(
     task="double_cartpole",
     trials=40,
@@ -75,7 +75,7 @@ DOUBLE_CARTPOLE_NETWORK = Config(
 
 
 def swimmer(maneuver: str, legs: int) -> Config:
-    """The networks of docs/reference.md 3.4, five of them (docs/decisions/0017), with the search of README's table."""
+    """The networks of docs/reference.md 3.4, five of them (docs/decisions.md 0017); README's search."""
     return Config(
         task=f"swimmer_{maneuver}",
         legs=legs,
@@ -90,14 +90,14 @@ def swimmer(maneuver: str, legs: int) -> Config:
             cost_width_start=1.0,
             standardized_noise=True,
             refine_fraction=0.5,
-            init="fresh",  # docs/decisions/0016
+            init="fresh",  # docs/decisions.md 0016
         ),
         explore=Explore(trials=2, kind="walk"),
     )
 
 
-# A cost of one's own has no width to widen; its expectation is a mean over nodes: docs/decisions/0018. A plant of one's
-# own may start anywhere: 0024. It is to hold for longer than an episode: 0023.
+# A cost of one's own has no width to widen; its expectation is a mean over nodes: docs/decisions.md 0018. Such a plant
+# may start anywhere: 0024. It is to hold for longer than an episode: 0023.
 _OWN_PLANT = Search(
     cost_width_start=1.0, standardized_noise=True, refine_fraction=0.5, matching="narrow", visited_starts=0.5
 )
@@ -122,7 +122,7 @@ NETWORKS: dict[str, Config] = {
 PRESETS: dict[str, Config] = {
     "cartpole": CARTPOLE,
     "double_cartpole": DOUBLE_CARTPOLE,
-    "double_cartpole_gpu": replace(  # eight policies side by side: docs/decisions/0010
+    "double_cartpole_gpu": replace(  # eight policies side by side: docs/decisions.md 0010
         DOUBLE_CARTPOLE,
         fit=replace(DOUBLE_CARTPOLE.fit, steps=3000),
         search=replace(DOUBLE_CARTPOLE.search, num_starts=8, particles=96, steps=2000),

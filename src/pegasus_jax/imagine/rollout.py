@@ -12,7 +12,7 @@ from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenario
 from pegasus_jax.vectorized import for_particles
 
 # Platform -> steps of the time loop compiled as one. Each round of a loop costs a GPU copies and launches
-# (docs/decisions/0013); a CPU would only compile longer.
+# (docs/decisions.md 0013); a CPU would only compile longer.
 UNROLL = {"gpu": 25}
 
 
@@ -35,7 +35,7 @@ def rollout(
     noise: NoiseUse = NoiseUse(),
     limit: Array | float | None = None,
 ) -> Rollout:
-    """Roll K particles out for H steps (Alg. 3 lines 6 to 14).
+    """Roll K particles out for H steps (Alg. 3 lines 6 to 14): states [H + 1, K, D], controls [H, K, U].
 
     Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match` is
     `matching.match` or `matching.keep`. No gradient flows through the predicted noise. With a `limit`, none goes back

@@ -66,7 +66,7 @@ def blocks(
 
 
 def draw(key: Key, step: Array | int, posterior: Params, *, blocks: Blocks, period: Period) -> Scenarios:
-    """The scenarios in force at a search iteration.
+    """The scenarios in force at a search iteration: starts [K, D], normal draws [H, K, D], ...
 
     Block b at iteration i is drawn from fold_in(fold_in(key, b), i // period_b): any iteration's scenarios can be had
     without those before it, so a search may stop and go on anywhere.

@@ -1,4 +1,4 @@
-"""The experience so far, in arrays of fixed capacity."""
+"""The experience so far, in arrays of fixed capacity: x [N, D], u [N, U], y [N, D]."""
 
 import jax
 import jax.numpy as jnp

@@ -32,7 +32,7 @@ def fit(
     steps: int,
     batch_size: int,
 ) -> tuple[TrainState, FitInfo]:
-    """`steps` updates of the model's parameters, each on `batch_size` rows and fresh noise (Alg. 1 line 5).
+    """`steps` updates of the model's parameters, each on `batch_size` rows of the [N, D] in use (Alg. 1 line 5).
 
     `optimizer` is any of optax, and `learner.optimizer` its state, `optimizer.init(params)`. A gradient with a
     non-finite entry changes neither. An optimizer that searches along a line gets the loss of the same rows and noise.

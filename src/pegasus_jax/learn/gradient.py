@@ -33,7 +33,8 @@ def gradient_search(
 ) -> tuple[TrainState, SearchInfo]:
     """Alg. 3 as printed: `steps` updates along the gradient of `objective` under the scenarios of each iteration.
 
-    The learner is policy parameters and `optimizer.init` of them. A gradient with a non-finite entry changes nothing.
+    The learner is policy parameters and `optimizer.init` of them. A gradient that is not finite changes nothing. The
+    information has an entry for each of the N steps, [N].
     """
 
     def step(carry: tuple[TrainState, Scenarios], i: Array) -> tuple[tuple[TrainState, Scenarios], SearchInfo]:

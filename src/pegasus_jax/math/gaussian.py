@@ -240,7 +240,7 @@ def ssgp_moments(
     """Moments of E independent sparse-spectrum Gaussian processes (Quinonero-Candela 2010; Lazaro-Gredilla et al.
     2010).
 
-    Output e is weights_e @ (cos(W_e x), sin(W_e x)) with frequencies W [E, m, F] [rad per unit of x] and Gaussian
+    Output e is weights_e @ (cos(W_e x), sin(W_e x)) with frequencies W [E, m, F], rad per unit of x, and Gaussian
     weights, weight_mean [E, 2m], weight_cov [E, 2m, 2m] (None: known weights); all m cosines come first. The
     observation noise is not in the covariance. Cost: E (E + 1) / 2 matrices [m, m], whatever the number of data.
     """

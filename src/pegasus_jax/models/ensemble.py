@@ -17,7 +17,7 @@ class Dealt(NamedTuple):
 
 
 def ensemble(member: Dynamics, members: int) -> Dynamics:
-    """`members` models of one kind as one distribution over functions.
+    """`members` models of one kind as one distribution over functions of (x [D], u [U]).
 
     They differ by their initial parameters and by their minibatches: each draws its own rows, with replacement, from
     the batch it is given. A particle follows one member, and one draw of that member, along its whole trajectory

@@ -58,7 +58,7 @@ def lagrangian(
 ) -> Dynamics:
     """A distribution over mechanisms with n = D / 2 generalized coordinates q and their speeds v, in any order in x.
 
-    A network with noise on its units says, of q alone, the lower triangular root L of the mass matrix and the
+    A network with noise on its units says, of q [n] alone, the lower triangular root L of the mass matrix and the
     potential V; M = L L'. With constants B, c and R beside it, and all in the data's units,
 
         M dv/dt = B u + c - R v - (dM/dt) v + d/dq (v' M v / 2 - V),

@@ -36,7 +36,7 @@ class Draw(NamedTuple):
 
 
 def gp(*, states: int, controls: int, angles: tuple[int, ...], features: int = 200) -> Dynamics:
-    """A Gaussian process over (encoded state, control) for each dimension of the change of state.
+    """A Gaussian process over (encoded state, control) [F + U] for each dimension of the change of state [D].
 
     ARD squared exponential kernels; hyperparameters and noise by marginal likelihood (Rasmussen & Williams 2006, ch. 2
     and 5). A draw is a function, by pathwise conditioning (Wilson et al. 2020, eq. 13): a prior sample from random

@@ -25,7 +25,7 @@ def rbf(
     saturate: Callable[[Array], Array],
     saturate_moments: Map | None,
 ) -> Policy:
-    """u = saturate(k(encode(x), centres) beta) with beta = (K + noise I)^-1 targets (docs/reference.md 5.1).
+    """u [U] = saturate(k(encode(x [D]), centres) beta), beta = (K + noise I)^-1 targets (docs/reference.md 5.1).
 
     Every control has targets and length scales of its own; the centres are shared. `start` draws the states at which
     the centres begin, the last `waves` features of `encode` are sines and cosines. `saturate_moments` is the moment

@@ -32,7 +32,7 @@ class Posterior(NamedTuple):
 
 
 def ssgp(*, states: int, controls: int, angles: tuple[int, ...], points: int = 100) -> Dynamics:
-    """A sparse-spectrum Gaussian process over (encoded state, control) for each dimension of the change of state.
+    """A sparse-spectrum Gaussian process over (encoded state, control) [F + U] for each change of state [D].
 
     Each output is a weighted sum of the cosines and sines of `points` phases; the weights have independent Gaussian
     priors of variance signal^2 / points, and frequencies, length scales, signal and noise maximize the evidence

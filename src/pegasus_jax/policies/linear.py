@@ -20,7 +20,7 @@ def linear(
     saturate_moments: Map | None,
     scale: float = 0.1,
 ) -> Policy:
-    """u = saturate(weights @ encode(x) + bias) (Deisenroth 2010, sec. 3.5.2).
+    """u [U] = saturate(weights [U, F] @ encode(x [D]) + bias [U]) (Deisenroth 2010, sec. 3.5.2).
 
     Initial weights are normal with standard deviation `scale`. `saturate_moments` is the moment form of `saturate`, or
     None where there is none: then the policy has no `moments`.

@@ -23,7 +23,7 @@ def mlp(
     input_scale: Array | float = 1.0,
     output_scale: float = 1.0,
 ) -> Policy:
-    """u = saturate(network(encode(x) * input_scale)); noise is on each hidden layer's output (docs/reference.md 5.1).
+    """u [U] = saturate(network(encode(x [D]) * input_scale)); noise on hidden layers' outputs (docs/reference.md 5.1).
 
     What the data have large is standardized on its way in, see `scaled`. The outgoing weights begin `output_scale`
     times as large as usual: a small one begins with controls near the middle of their range.

@@ -29,7 +29,7 @@ NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
 GRAPHS = {
     "xla_gpu_enable_command_buffer": "CONDITIONAL,CUBLAS,CUBLASLT,CUDNN,CUSTOM_CALL,DYNAMIC_SLICE_FUSION,FUSION,WHILE"
 }
-# And side by side the kernels of a graph that do not wait for each other (docs/decisions/0013).
+# And side by side the kernels of a graph that do not wait for each other (docs/decisions.md 0013).
 CONCURRENT_KERNELS = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
 
 # The compiler's options by platform. On a CPU what runs for milliseconds need not be compiled well: without

@@ -23,7 +23,7 @@ def stuck(before: Sequence[dict[str, Any]], now: Sequence[dict[str, Any]]) -> li
     if imagined is None or imagined >= AS_BAD * cost:
         why = (
             "the search finds nothing better: the cost may be flat where the plant is, so let it fall from farther away"
-            " (docs/extending.md), or the limits may be too narrow for the task"
+            " (docs/robot.md), or the limits may be too narrow for the task"
         )
     else:
         why = (

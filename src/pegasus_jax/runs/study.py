@@ -69,7 +69,7 @@ def one_json(config: Config, seeds: list[int], task: Task, keep: Callable[[dict[
 
 
 def curves(config: Config, seeds: list[int], trials: list[list[Row]], task: Task) -> dict[str, Any]:
-    """What is kept of the trials so far, each a row a seed (docs/method.md 20 explains the curves)."""
+    """What is kept of the trials so far, each a row a seed (docs/understanding.md explains the curves)."""
 
     def of(name: str) -> list[list[Any]]:
         return [[rows[index][name] for rows in trials] for index in range(len(seeds))]

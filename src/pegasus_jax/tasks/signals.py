@@ -29,7 +29,7 @@ def with_signals(task: Task, config: Config) -> Task:
 
 
 def named(config: Config) -> tuple[Callable[[Array], Array] | None, Callable[[Key], Array] | None]:
-    """A config's reference, t [] [s] -> [R], and how it draws goals, key -> [G]; None for what it has not.
+    """A config's reference, t in [s] -> [R], and how it draws goals, key -> [G]; None for what it has not.
 
     Raises ConfigError, in one line, for what they cannot be.
     """
