@@ -13,7 +13,7 @@ CODE  := $(wildcard src envs tests benchmarks examples)
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations 10
 
 .DEFAULT_GOAL := help
-.PHONY: help setup train test test-slow campaigns check format bench bench-compare figures docs lock clean
+.PHONY: help setup train test test-slow campaigns check format bench bench-compare figures docs pictures lock clean
 .DELETE_ON_ERROR:
 
 help: ## list the targets
@@ -55,7 +55,10 @@ bench-compare: $(STAMP) ## measure speed again and fail if it is below .77 of th
 figures: $(STAMP) ## run one of the paper's experiments: make figures FIGURE=crn
 	$(BIN)/python -m benchmarks.paper benchmarks/paper/$(FIGURE).toml out=benchmarks/results $(ARGS)
 
-docs: $(STAMP) ## draw the pictures of README.md and docs/ again
+docs: $(STAMP) ## build the documentation site into site/, without a network; a warning is an error
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --strict $(ARGS)
+
+pictures: $(STAMP) ## draw the pictures of README.md and docs/ again
 	$(BIN)/python -m benchmarks.pictures $(ARGS)
 
 lock: $(BIN)/python ## write requirements.lock again, for every Python and platform; newer versions: make lock ARGS=--upgrade
@@ -64,7 +67,7 @@ lock: $(BIN)/python ## write requirements.lock again, for every Python and platf
 	  --generate-hashes --no-emit-index-url --no-emit-find-links --no-annotate $(ARGS) pyproject.toml -o requirements.lock
 
 clean: ## remove .venv and every cache; runs/ stays
-	rm -rf $(VENV) build dist .pytest_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build dist site .pytest_cache .ruff_cache .hypothesis
 	find $(CODE) -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:

@@ -58,6 +58,12 @@ def test_a_readers_first_scripts_are_short_and_use_public_names_alone() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("program", sorted((EXAMPLES / "api").glob("*.py")), ids=lambda path: path.stem)
+def test_the_examples_of_the_api_reference_run(program: Path, tmp_path: Path, tools: dict[str, str]) -> None:  # noqa: F811
+    shell(f"python {program}", tmp_path, tools)
+
+
+@pytest.mark.slow
 def test_a_model_of_ones_own_learns(folder: Path, tools: dict[str, str]) -> None:  # noqa: F811
     """Its first episode is random; from the second on the cart is brought to its goal, as the model expected."""
     shell("python own_model_in_jit.py > said", folder, tools)
