@@ -67,9 +67,9 @@ def search(
     """The rows of iterations first .. first + steps - 1 of the problem's table, in the search after `earlier` others.
 
     A search that only refines begins at the first that does, as 0; those that it lacks are NaN in the info. One call
-    of n steps and two of n/2, the second with first=n/2, do the same. `fresh` is a policy that the table may ask for.
-    All rows visit one objective: a second one would take as long again to compile. Raises
-    ValueError for more iterations than the table has, and where its fresh policy is missing.
+    of n steps and two of n/2, the second with first=n/2, do the same; the info is [n]. `fresh` is a policy that the
+    table may ask for. All rows visit one objective: a second one would take as long again to compile. Raises ValueError
+    for more iterations than the table has, and where its fresh policy is missing.
     """
     table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)
     if steps > (most := len(begin) - 1):
@@ -78,8 +78,8 @@ def search(
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
     rows = of_search(table, earlier)
     following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
-    begun = first + jnp.where(problem.only_refines, np.sum(~table.refine[begin[:-1]]), 0)
-    row, end = (jnp.asarray(begin)[jnp.minimum(i, most)] for i in (begun, begun + steps))
+    offset = first + jnp.where(problem.only_refines, np.sum(~table.refine[begin[:-1]]), 0)
+    row, end = (jnp.asarray(begin)[jnp.minimum(i, most)] for i in (offset, offset + steps))
     count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
 
     def visit(k: Array, loop: tuple) -> tuple:
@@ -89,7 +89,7 @@ def search(
         visited = jax.tree.map(choose, own, fresh if asks else own, state.start, state.start)
         value, gradient, weight = valued(problem, state.multiplier, visited, posterior, scenarios, now)
         learner, cost, skipped = after(now, learner, visited, value, gradient, weight, problem)
-        i = now.iteration - begun
+        i = now.iteration - offset
         stepped = jnp.where(now.action == STEP, i, steps)
         norms = info.gradient_norm.at[stepped].set(optax.tree.norm(gradient), mode="drop")
         scenarios = sampler.redraw(key, following[row + k], scenarios, posterior)
@@ -99,9 +99,9 @@ def search(
     optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
     begins, new = jnp.asarray(first) == 0, state._replace(optimizer=optimizer, start=params)
     learner = TrainState(params, optax.tree.where(begins, new, state))
-    scenarios, none = sampler.draw(key, jnp.asarray(begun, jnp.int32), posterior), jnp.full(steps, jnp.nan)
+    scenarios, none = sampler.draw(key, jnp.asarray(offset, jnp.int32), posterior), jnp.full(steps, jnp.nan)
     learner, _, info = jax.lax.fori_loop(0, count, visit, (learner, scenarios, SearchInfo(none, none, jnp.int32(0))))
-    return learner, info._replace(iterations=jnp.clip(most - begun, 0, steps))
+    return learner, info._replace(iterations=jnp.clip(most - offset, 0, steps))
 
 
 def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:

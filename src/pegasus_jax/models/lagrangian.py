@@ -56,7 +56,7 @@ def lagrangian(
     weight_decay: float = 1.0,
     **noise: Any,
 ) -> Dynamics:
-    """A distribution over mechanisms with n = D / 2 generalized coordinates q and their speeds v, in any order in x.
+    """A distribution over mechanisms with n = D / 2 generalized coordinates q and speeds v, in any order in x [D].
 
     A network with noise on its units says, of q [n] alone, the lower triangular root L of the mass matrix and the
     potential V; M = L L'. With constants B, c and R beside it, and all in the data's units,
