@@ -240,6 +240,7 @@ def test_every_block_is_a_program_a_file_or_commands() -> None:
         "in_runtimes.py",
         "export_both.py",
         "hand.py",
+        "rows.py",
     }
     assert len(PROGRAMS) >= 4
 

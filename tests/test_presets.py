@@ -144,6 +144,7 @@ def test_the_method_has_few_settings():
     plant = {*config_io.used_by()}
     assert len(settings() - plant) <= 55
     assert plant == {
+        "control_rate",
         "sensors.measured",
         "sensors.delay",
         "sensors.velocity",

@@ -20,6 +20,7 @@ from pegasus_jax.exports import as_c, write
 from pegasus_jax.imagine import matching
 from pegasus_jax.imagine.rollout import rollout
 from pegasus_jax.models.sharpened import sharpened
+from pegasus_jax.policies.rate_limited import rate_limited
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.tasks.remembered import polynomials, remembering, smoothed
@@ -34,6 +35,8 @@ KINDS = {
     "difference": dict(sensors=Sensors(measured=(0,), velocity="difference")),
     "late filter": dict(sensors=Sensors(measured=(0,), velocity="filter", delay=1)),
     "history": dict(sensors=Sensors(measured=(0,), delay=1), history=3),
+    "slow": dict(control_rate=(0.4,)),
+    "slow and late": dict(sensors=Sensors(measured=(0,), velocity="difference", delay=1), control_rate=(0.4,)),
 }
 
 
@@ -64,7 +67,7 @@ def test_imagined_with_the_true_model_is_what_the_plant_does(name):
     Of a history from the row on at which it tells the rate.
     """
     _, task = sensing(name)
-    policy = linear_policy(len(memory.seen_names(task)), 1)._replace(memory=task.memory)
+    policy = rate_limited(linear_policy(len(memory.seen_names(task)), 1)._replace(memory=task.memory), task)
     gain = 0.5 * jax.random.normal(jax.random.key(4), (1, len(memory.seen_names(task)))) - 0.3
     ran = run(jax.random.key(0), lambda key, t, seen: policy.apply(gain, None, seen), task)
     whole = memory.join(ran.x, memory.replay(task.memory, ran))
@@ -74,7 +77,9 @@ def test_imagined_with_the_true_model_is_what_the_plant_does(name):
     rolled = rollout(gain, None, given, dynamics=exact(task), policy=policy, match=matching.keep)
     np.testing.assert_allclose(rolled.u[:, 0], ran.u[first:], rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(rolled.x[:, 0], whole[first:], rtol=1e-3, atol=1e-3)
-    assert ran.u.std() > 0.05
+    assert ran.u.std() > 0.02
+    if "slow" in name:
+        assert np.abs(np.diff(ran.u[:, 0], prepend=0)).max() == pytest.approx(0.4 * DT)
 
 
 def test_a_late_plant_is_the_plant_of_the_controls_before():
@@ -156,6 +161,7 @@ SETTINGS = {
     "filter": "sensors.measured=[0,3] sensors.velocity=filter sensors.cutoff=1.5 x64=true",
     "history": "sensors.measured=[0,3] history=3 sensors.delay=1 model=log_normal",
     "late": "sensors.delay=2",
+    "slow": "control_rate=20",
 }
 
 
@@ -175,8 +181,10 @@ def test_a_file_remembers_as_the_controller_does(sensor_run):
     for format in ("numpy", *(["c"] if any(map(as_c.shutil.which, as_c.COMPILERS)) else [])):
         said = json.loads(write.contract_of(write.export(run_of, 2, format)).read_text())
         assert said["parity"]["largest_difference"] <= said["parity"]["allowed"]
-        assert len(said["observation"]) == (4 if name == "late" else 2)
-        assert said["history"]["controls"] == {"difference": 2, "filter": 1, "history": 3, "late": 2}[name]
+        assert len(said["observation"]) == (4 if name in ("late", "slow") else 2)
+        kept = {"difference": 2, "filter": 1, "history": 3, "late": 2, "slow": 1}
+        assert said["history"]["controls"] == kept[name]
+        assert said["control"][0].get("rate_per_s") == (20 if name == "slow" else None)
         assert (said["filter"] != "none") == (name in ("difference", "filter"))
     with pytest.raises(ConfigError, match=r"format=onnx cannot write a controller that remembers .* format=numpy"):
         write.export(run_of, 2, "onnx")
@@ -184,8 +192,8 @@ def test_a_file_remembers_as_the_controller_does(sensor_run):
 
 def test_a_reset_forgets_the_episode(sensor_run):
     name, run_of = sensor_run
-    control = controller(run_of, 2)
-    first, second = np.full(4 if name == "late" else 2, 0.1), np.full(4 if name == "late" else 2, 0.4)
+    control, size = controller(run_of, 2), 4 if name in ("late", "slow") else 2
+    first, second = np.full(size, 0.1), np.full(size, 0.4)
     fresh = control(second)
     control.reset()
     control(first)

@@ -261,6 +261,9 @@ class Config:
         None, "module:function, observation [D] -> numbers, each at most 0 where a policy may be, in JAX", EVERY
     )
     constraint_bound: float = setting(0.05, "most probable share of the episodes that break the constraint", EVERY)
+    control_rate: tuple[float, ...] = setting(
+        (), "largest rate of change of a control [its unit per s], one for all or one each; []: any", EVERY
+    )
     observe: tuple[str, ...] = setting((), "as [qpos.0,qvel.1]; []: all positions, then all velocities", (MJCF,))
     control_low: tuple[float, ...] = setting((), "least controls; []: the action space's, the file's ctrlrange", OWN)
     control_high: tuple[float, ...] = setting(
@@ -309,6 +312,8 @@ class Config:
             checks.finite("starts", row)
         checks.pairs("circles", self.circles or ())
         checks.choice("data_control", self.data_control, DATA_CONTROLS)
+        for rate in self.control_rate:
+            checks.check_range("control_rate", rate, 0, open_low=True)
         for deviation in self.start_std:
             checks.check_range("start_std", deviation, 0)
         checks.check_range("success", self.success, 0, open_low=True)

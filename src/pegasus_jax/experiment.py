@@ -18,6 +18,7 @@ from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.models.calibration import calibration
+from pegasus_jax.policies.rate_limited import before, explored
 from pegasus_jax.shapes import check_shape
 from pegasus_jax.task import Task
 from pegasus_jax.types import (
@@ -135,18 +136,13 @@ def experiment(
     def act(params: Params, key: Key, x: Array) -> Array:
         return policy.apply(params, policy.sample(key), x)
 
-    def guided(x: Any, added: Any, numpy: Any) -> Any:
-        """The controls [U] of the task's first controller, and what is added to them, within the limits."""
-        u = numpy.asarray(task.guide(x), added.dtype) + added  # type: ignore[misc]
-        return numpy.clip(u, numpy.asarray(task.control_low), numpy.asarray(task.control_high)).astype(added.dtype)
-
     def one_episode(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
         """An episode of the policy, or of random controls. One function, because a plant is slow to compile."""
         plan_key, run_key = jax.random.split(key)
         plan = explore(plan_key)
 
         def control(key: Key, t: Array, x: Array) -> Array:
-            first = plan[t] if task.guide is None else guided(x[:states], plan[t], jnp)
+            first = explored(task, x[:states], plan[t], before(x, task), jnp)
             return jnp.where(exploring, first, act(policy_params, key, x))
 
         return episode.run(run_key, control, task)
@@ -174,13 +170,15 @@ def experiment(
         resting = np.zeros(states, np.float32)
         react(policy_params, jax.tree.map(lambda z: z[0], noise), begin(seed_key, resting), resting)
         first = m = None
+        sent = recall.resting(task).astype(plan.dtype)
 
         def control(t: int, x: np.ndarray) -> np.ndarray:
-            nonlocal first, m
+            nonlocal first, m, sent
             if t == 0:
                 first = m = begin(seed_key, x)
             if exploring:
-                return plan[t] if task.guide is None else guided(x, plan[t], np)
+                sent = explored(task, x, plan[t], sent, np)
+                return sent
             u, m = react(policy_params, jax.tree.map(lambda z: z[t], noise), m, x)
             return np.asarray(u)
 

@@ -51,6 +51,7 @@ class Task(NamedTuple):
     reference: Signal | None = None
     goal: Signal | None = None
     constraint: Any = None  # an `imagine.limits.Constraint`; None: a policy may do anything
+    control_rate: Any = None  # [U] the largest rate of change of each control [1/s]; None: any
     guide: Callable[[Any], Any] | None = None  # x [D] -> u [U], the controller of the first episodes; None: random
 
     @property

@@ -15,6 +15,7 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.imagine import visited
 from pegasus_jax.models.residual import on_differences, residual
+from pegasus_jax.policies.rate_limited import rate_limited
 from pegasus_jax.sharding import over_particles
 from pegasus_jax.task import Task
 from pegasus_jax.tasks.remembered import remembering
@@ -67,7 +68,7 @@ def compose(
     visits = bool(config.search.visited_starts) and searcher is None
     dynamics = visited.remembering(dynamics) if visits else dynamics
     policy = policy or policy_of(config.policy, task)
-    policy = policy._replace(memory=task.memory) if task.memory.names else policy
+    policy = rate_limited(policy._replace(memory=task.memory) if task.memory.names else policy, task)
     searching = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     return experiment(
         task=task,

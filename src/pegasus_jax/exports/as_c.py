@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Recall, Squash, Standardize, layers_of
+from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Limit, Recall, Squash, Standardize, layers_of
 from pegasus_jax.exports.learned import Learned, said
 
 HEADER = """\
@@ -163,6 +163,14 @@ def _printed(layer: Layer, i: int, size: int) -> tuple[list[str], dict[str, np.n
                 "}",
             ]
             return lines, {"low": low, "high": high, "middle": layer.middle, "half": layer.half}, len(low)
+        case Limit(change):
+            lines = [
+                f"for (int i = 0; i < {len(change)}; ++i) {{",
+                "    const @T least = @P_past[i] - @P_change[i], most = @P_past[i] + @P_change[i];",
+                "    u[i] = u[i] < least ? least : u[i] > most ? most : u[i];",
+                "}",
+            ]
+            return lines, {"change": change}, len(change)
 
 
 def _entry(entries: tuple[int, ...], given: str = "x") -> str:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Recall, Squash, Standardize, layers_of
+from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Limit, Recall, Squash, Standardize, layers_of
 from pegasus_jax.exports.learned import Learned, said
 
 MODULE = '''\
@@ -94,9 +94,7 @@ def write(learned: Learned, name: str) -> bytes:
         lines, used = _printed(layer, number)
         code += lines
         arrays |= used
-    if remembers:
-        code[-1] = code[-1].replace("return", "control =")
-        code += REMEMBERED
+    code += REMEMBERED if remembers else ["return control"]
     text = MODULE.format(
         title=said(learned.title),
         name=name,
@@ -139,8 +137,12 @@ def _printed(layer: Layer, i: int) -> tuple[list[str], dict[str, np.ndarray]]:
             return lines, {f"CENTERS_{i}": centers, f"LENGTHSCALES_{i}": lengthscales, f"WEIGHTS_{i}": weights}
         case Squash(kind, low, high):
             squash = ["v = np.tanh(v)"] if kind == "tanh" else ["s = np.sin(v)", "v = (3 * s - s**3) / 2"]
-            limited = "return np.minimum(np.maximum(MIDDLE + HALF * v, LOW), HIGH)"
+            limited = "control = np.minimum(np.maximum(MIDDLE + HALF * v, LOW), HIGH)"
             return [*squash, limited], {"LOW": low, "HIGH": high, "MIDDLE": layer.middle, "HALF": layer.half}
+        case Limit(change):
+            size = len(change)
+            limited = f"np.minimum(np.maximum(control, past[:{size}] - CHANGE), past[:{size}] + CHANGE)"
+            return [f"control = {limited}"], {"CHANGE": change}
 
 
 REMEMBERED = [

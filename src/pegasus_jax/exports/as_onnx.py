@@ -11,6 +11,7 @@ from pegasus_jax.exports.layers import (
     Features,
     Kernels,
     Layer,
+    Limit,
     Recall,
     Squash,
     Standardize,
@@ -76,7 +77,7 @@ def _added(graph: Graph, layer: Layer, v: str, dtype: np.dtype) -> str:
     """Add the nodes of a layer, v to the value that is returned."""
     node, constant = graph.node, graph.constant
     match layer:
-        case Recall():
+        case Recall() | Limit():
             raise AssertionError("a graph remembers nothing")
         case Features(plain, angles):
             waves = [_waves(graph, v, pair, dtype) for pair in angles]

@@ -17,6 +17,7 @@ from pegasus_jax.tasks.remembered import kept_by
 def contract(learned: Learned, format: str, file: Path, data: bytes, parity: Parity, command: str) -> dict[str, Any]:
     """The contract of a file of these bytes. Observations and controls are in the order of their entries."""
     task = learned.task
+    rates = task.control_rate
     low, high = (np.asarray(limit, float).tolist() for limit in (task.control_low, task.control_high))
     controls = zip(task.control_names, low, high, strict=True)
     cosines = {entry: part for pair in task.circles for entry, part in zip(pair, ("cosine", "sine"), strict=True)}
@@ -36,7 +37,10 @@ def contract(learned: Learned, format: str, file: Path, data: bytes, parity: Par
             | ({"is": "asked for, no sensor's"} if i >= len(learned.observation) - len(learned.asked) else {})
             for i, name in enumerate(learned.observation)
         ],
-        "control": [named(name) | {"low": low, "high": high} for name, low, high in controls],
+        "control": [
+            named(name) | {"low": low, "high": high} | ({} if rates is None else {"rate_per_s": float(rates[i])})
+            for i, (name, low, high) in enumerate(controls)
+        ],
         **_memory(learned),
         "parity": {**parity._asdict(), "allowed": parity.allowed, "against": "pegasus_jax.controller"},
         "command": command,

@@ -11,6 +11,7 @@ from pegasus_jax.config import MLP, RBF, Linear
 from pegasus_jax.exports.learned import Learned
 from pegasus_jax.math.circles import entries
 from pegasus_jax.pilco.rbf import regress
+from pegasus_jax.policies.rate_limited import largest_change
 from pegasus_jax.runs.restore import precision
 from pegasus_jax.tasks.remembered import kept_by, remembering
 from pegasus_jax.types import NO_MEMORY
@@ -93,7 +94,13 @@ class Squash(NamedTuple):
         return (self.high - self.low) / 2
 
 
-Layer = Recall | Features | Standardize | Dense | Kernels | Squash
+class Limit(NamedTuple):
+    """u is moved towards the control before until it differs from that by no more than this."""
+
+    change: np.ndarray  # [U]
+
+
+Layer = Recall | Features | Standardize | Dense | Kernels | Squash | Limit
 
 
 def layers_of(learned: Learned, format: str) -> tuple[Layer, ...]:
@@ -114,7 +121,10 @@ def layers_of(learned: Learned, format: str) -> tuple[Layer, ...]:
         case _:
             raise ConfigError(f"format={format} cannot write this policy; the nearest is format=stablehlo")
     low, high = (_array(limit, dtype) for limit in (learned.task.control_low, learned.task.control_high))
-    return (*_features(learned), *middle, Squash(settings.squash, low, high))
+    layers = (*_features(learned), *middle, Squash(settings.squash, low, high))
+    return (
+        layers if learned.task.control_rate is None else (*layers, Limit(_array(largest_change(learned.task), dtype)))
+    )
 
 
 def forgetful(learned: Learned, format: str) -> None:

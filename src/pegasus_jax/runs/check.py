@@ -10,6 +10,7 @@ from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math.circles import entries
+from pegasus_jax.policies.rate_limited import largest_change
 from pegasus_jax.runs import first
 from pegasus_jax.runs.logged import read_config
 from pegasus_jax.task import Task
@@ -26,8 +27,9 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     is looked at first: a mistake in it moves no robot.
     """
     guide.check(config, task)
+    rates = slow(task)
     if config.cost is None and task.constraint is None:
-        return []
+        return rates
     low, high = tasks.observation_limits(config, task)
     facts = cost_check.Facts(
         np.asarray(task.start_mean, float),
@@ -41,13 +43,32 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     )
     limits = constrained.notes(task.constraint, facts, f"constraint={shown(config.constraint)}")
     if config.cost is None:
-        return limits
+        return [*rates, *limits]
     beside = cost_check.beside(facts, task)
     notes = [*cost_check.notes(task.cost.of_state, beside, f"cost={shown(config.cost)}"), *limits]
     stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)
-    return [*notes, *plausible(readings, facts, task.state_names), *alike(readings, task.angles, task.state_names)]
+    return [
+        *rates,
+        *notes,
+        *plausible(readings, facts, task.state_names),
+        *alike(readings, task.angles, task.state_names),
+    ]
+
+
+def slow(task: Task) -> list[str]:
+    """Notes on limits of how fast a control changes that never matter, or that leave an episode too short."""
+    notes = []
+    for name, change, low, high in zip(
+        task.control_names, largest_change(task), task.control_low, task.control_high, strict=True
+    ):
+        way, rate = f"{name} from {low:g} to {high:g}", change / task.dt
+        if np.isfinite(change) and change >= high - low:
+            notes.append(f"control_rate={rate:g} lets {way} in one period: it limits nothing")
+        elif (periods := (high - low) / change) > task.horizon:
+            notes.append(f"control_rate={rate:g} lets {way} in {periods:.0f} periods; an episode has {task.horizon}")
+    return notes
 
 
 def circles_found(given: Config, known: Config) -> list[str]:
@@ -144,7 +165,10 @@ def report(config: Config) -> list[str]:
         "observation": ", ".join(task.state_names),
         "control": ", ".join(
             f"{name} from {low:g} to {high:g}"
-            for name, low, high in zip(task.control_names, task.control_low, task.control_high, strict=True)
+            + ("" if np.isinf(change) else f", by at most {change / task.dt:g} a second")
+            for name, low, high, change in zip(
+                task.control_names, task.control_low, task.control_high, largest_change(task), strict=True
+            )
         ),
         "time": f"{task.horizon} periods of {task.dt:g} s an episode, {task.horizon * task.dt:g} s",
         "start": f"{_numbers(task.start_mean)}, give or take {_numbers(task.start_std)}",

@@ -19,6 +19,7 @@ from pegasus_jax.runs.removed import refuse, today
 
 # Keys that select what a command begins with, and what they select from.
 NAMED: dict[str, Any] = {"task": TASKS, **WORDS}
+ONE_FOR_ALL = ("control_rate",)  # settings of numbers, or of one number for all
 FILES = ("data",)  # settings of files and patterns: one, or a list of them; * means something else in YAML
 
 
@@ -236,6 +237,8 @@ def _converted(node: Any, name: str, value: Any, key: str) -> Any:
     if "${" in str(value):  # OmegaConf would put another setting there, or a variable of the environment
         raise ConfigError(f"{key}={shown(value)} is not a value but a reference to one; write the value itself")
     current = getattr(node, name)
+    if key in ONE_FOR_ALL and isinstance(value, int | float) and not isinstance(value, bool):
+        value = [value]
     field = next(f for f in dataclasses.fields(node) if f.name == name)
     if callable(value):
         return value  # from Python: the config says whether it can be one

@@ -11,8 +11,10 @@ from pegasus_jax.config import Config, Sensors
 from pegasus_jax.episode import drive
 from pegasus_jax.math.delays import MOST, Delay, delay_of, enough
 from pegasus_jax.memory import resting
+from pegasus_jax.policies.rate_limited import largest_change
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.task import Task
+from pegasus_jax.tasks.remembered import limited_by
 
 EPISODES = 20  # at most, of an environment whose episodes end early
 
@@ -37,7 +39,9 @@ def measure(config: Config, amplitude: float = 0.1, periods: int = 200, most: in
     task = _of_environment(config)
     check_range("periods", periods, most + enough(len(task.control_names), most), 10**6)
     low, high = np.asarray(task.control_low), np.asarray(task.control_high)
-    rest, size = resting(task), amplitude * (high - low) / 2
+    rest = resting(task)
+    # From one value to the other is twice this.
+    size = np.minimum(amplitude * (high - low) / 2, largest_change(task) / 2)
     draw, episodes = np.random.default_rng(config.seed), []
     try:
         while (left := periods - sum(len(u) for _, u in episodes)) > 0 and len(episodes) < EPISODES:
@@ -61,7 +65,8 @@ def _of_environment(config: Config) -> Task:
         raise ConfigError("pegasus-delay drives an environment; for example env=robot:Arm-v0")
     still = (0.0,) * tasks.environment(config).observation_space.shape[0]  # where episodes start is of no interest
     bare = replace(config, goals=None, goal_low=(), goal_high=(), reference=None, sensors=Sensors(), history=1)
-    return tasks.of_config(replace(bare, cost=_nothing, stop=None, circles=(), start_mean=still, starts=()))
+    task = tasks.of_config(replace(bare, cost=_nothing, stop=None, circles=(), start_mean=still, starts=()))
+    return task._replace(control_rate=limited_by(config, task))
 
 
 def _nothing(x: object) -> float:

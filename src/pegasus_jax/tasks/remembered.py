@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math.angles import difference, encode
 from pegasus_jax.memory import combined, past_controls, resting
@@ -17,6 +18,7 @@ WINDOW, ORDER = 5, 3  # rows of the local polynomial that tells rates afterwards
 
 def remembering(config: Config, task: Task) -> Task:
     """The task with what its controller remembers, and its states as they are known afterwards, by the settings."""
+    task = task._replace(control_rate=limited_by(config, task))
     kept, memories = kept_by(config, task), [task.memory]
     if kept.controls:
         memories.append(history(task, rows=1 + kept.rows, delay=config.sensors.delay, controls=kept.controls))
@@ -42,7 +44,20 @@ def kept_by(config: Config, task: Task) -> Kept:
     if sensors.velocity == "filter":  # a low-pass of first order
         weight = float(1 - np.exp(-2 * np.pi * (sensors.cutoff or 0.2 / task.dt) * task.dt))
     # A difference is the rate half a period ago: what has acted since then, one more control tells.
-    return Kept(sensors.delay + rows + rates, rows, rates, weight)
+    controls = max(sensors.delay + rows + rates, task.control_rate is not None)
+    return Kept(controls, rows, rates, weight)
+
+
+def limited_by(config: Config, task: Task) -> np.ndarray | None:
+    """The largest rate of change [U] of each control by the settings. Raises ConfigError for another number of them."""
+    rates, names = config.control_rate, task.control_names
+    if not rates:
+        return task.control_rate
+    if len(rates) not in (1, len(names)):
+        raise ConfigError(
+            f"control_rate={shown(rates)} must be one number for all, or {len(names)}, of {', '.join(names)}"
+        )
+    return np.broadcast_to(np.array(rates), (len(names),))
 
 
 def history(task: Task, *, rows: int, delay: int, controls: int) -> Memory:
@@ -52,8 +67,8 @@ def history(task: Task, *, rows: int, delay: int, controls: int) -> Memory:
     acts now, those of the rows before, and these rows' observations, angles as sines and cosines.
     """
     size, states, past_rows = len(task.control_names), len(task.state_names), rows - 1
-    shown = past_controls(task.control_names, resting(task), controls, shown=True)
-    kept = len(shown.names)
+    past = past_controls(task.control_names, resting(task), controls, shown=True)
+    kept = len(past.names)
     times = range(1, rows)
     names = tuple(f"{name} {i} before" for i in times for name in task.state_names)
     turning = tuple(states * i + a for i in range(past_rows) for a in task.angles)
@@ -63,13 +78,13 @@ def history(task: Task, *, rows: int, delay: int, controls: int) -> Memory:
         return jnp.concatenate([controls, encode(m[kept:], turning)]) if past_rows else controls
 
     def advance(m: Array, o: Array, u: Array) -> Array:
-        return jnp.concatenate([shown.advance(m[:kept], o, u), *([o, m[kept:]] if past_rows else [])])[: len(m)]
+        return jnp.concatenate([past.advance(m[:kept], o, u), *([o, m[kept:]] if past_rows else [])])[: len(m)]
 
     return Memory(
-        names=(*shown.names, *names),
-        start=lambda key, o: jnp.concatenate([shown.start(key, o), jnp.tile(o, past_rows)]),
+        names=(*past.names, *names),
+        start=lambda key, o: jnp.concatenate([past.start(key, o), jnp.tile(o, past_rows)]),
         advance=advance,
-        shown=(*shown.names, *names),
+        shown=(*past.names, *names),
         show=lambda m, o: m,
         shown_angles=tuple(kept + i for i in turning),
         applied=given,
