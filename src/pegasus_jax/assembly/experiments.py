@@ -9,7 +9,7 @@ from jax.sharding import Mesh
 
 from pegasus_jax import config as settings
 from pegasus_jax import episode, tasks
-from pegasus_jax.assembly.pieces import dynamics_of, fit_of, policy_of
+from pegasus_jax.assembly.pieces import drawing_rates, dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import limits, refines_successes, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
@@ -61,7 +61,7 @@ def compose(
     task = remembering(config, task._replace(cost=as_cost(task.cost)))
     task = tasks.whole(task, None if cost is None else as_cost(cost))
     dynamics = dynamics or dynamics_of(config.model, task)
-    fitter = fitter or fit_of(config.fit, dynamics)
+    fitter = fitter or drawing_rates(fit_of(config.fit, dynamics), dynamics, task)
     if task.prior is not None:  # then all of that is of what the simulator gets wrong
         fitter = on_differences(fitter, task.prior, task.angles)
         dynamics = residual(dynamics, task.prior, angles=task.angles)

@@ -24,7 +24,7 @@ def remembering(config: Config, task: Task) -> Task:
         memories.append(history(task, rows=1 + kept.rows, delay=config.sensors.delay, controls=kept.controls))
     if kept.rates:
         memories.append(velocities(task, kept.weight))
-        task = task._replace(hindsight=Hindsight(partial(smoothed, task=task), 2 * len(task.control_names)))
+        task = task._replace(hindsight=Hindsight(partial(smoothed, task=task), 1))
     return task._replace(memory=combined(*memories))
 
 
@@ -123,33 +123,26 @@ def smoothed(rows: Array, last: Array | int, controls: Array, *, task: Task) -> 
     """The states [H+1, D] of an episode whose observations [H+1, D] tell positions, up to row `last`.
 
     Rates are those of polynomials through the positions around each row, Savitzky and Golay's, after the fact: a filter
-    that runs on the robot knows only the rows before. Positions are as measured. The second value [H, 2 U] is by how
-    much more control, over a period, the rates of the rows t and t + 1 would be without error (`models.sharpened`).
+    that runs on the robot knows only the rows before. Positions are as measured. The second value [H, 1] is 1 in the
+    row that begins the episode, and 0: a fit draws better rates along it (`models.smoothed`).
     """
     positions = np.array([i for i in range(len(task.state_names)) if i not in task.rates])
     turning = tuple(place for place, i in enumerate(positions) if i in task.angles)
-    weights, corners = polynomials(task.dt)
+    weights = polynomials(task.dt)
+    rows = jnp.asarray(rows)
     steps = difference(rows[1:, positions], rows[:-1, positions], turning)
     q = jnp.concatenate([jnp.zeros_like(steps[:1]), jnp.cumsum(steps, 0)])  # no turn is lost at 180 degrees
-    u = controls[:, : len(task.control_names)]
-    turns = jnp.concatenate([jnp.zeros_like(u[:1]), u[1:] - u[:-1], jnp.zeros_like(u[:1])])  # of the control at a row
     times = jnp.arange(len(rows))
     first = jnp.clip(times - WINDOW // 2, 0, jnp.maximum(last - WINDOW + 1, 0))
     around, place = first[:, None] + jnp.arange(WINDOW), jnp.clip(times - first, 0, WINDOW - 1)
-    some = (around < last)[..., None]  # a control behind the end of an episode says nothing
     rates = jnp.einsum("tw,twn->tn", jnp.asarray(weights, q.dtype)[place], q[jnp.minimum(around, last)])
-    more = jnp.einsum("tw,twn->tn", jnp.asarray(corners, q.dtype)[place], jnp.where(some, turns[around], 0))
-    return rows.at[:, np.array(task.rates)].set(rates), jnp.concatenate([more[:-1], more[1:]], 1)
+    begins = (times[:-1, None] == 0).astype(q.dtype)
+    return rows.at[:, np.array(task.rates)].set(rates), begins
 
 
-def polynomials(dt: float) -> tuple[np.ndarray, np.ndarray]:
-    """For each place in a window of rows [WINDOW]: the weights of all its rows' positions in the rate there.
-
-    And that rate's error where the acceleration has changed by 1 at each of the rows, in periods of acceleration.
-    """
+def polynomials(dt: float) -> np.ndarray:
+    """For each place in a window of rows [WINDOW]: the weights of all its rows' positions in the rate there."""
     from scipy.signal import savgol_coeffs  # slow to import
 
     every = range(WINDOW)
-    weights = np.stack([savgol_coeffs(WINDOW, ORDER, deriv=1, delta=dt, pos=place, use="dot") for place in every])
-    since = np.maximum(np.arange(WINDOW)[:, None] - np.arange(WINDOW), 0) * dt  # [row, row of the change]
-    return weights, (weights @ (since**2 / 2) - since) / dt
+    return np.stack([savgol_coeffs(WINDOW, ORDER, deriv=1, delta=dt, pos=place, use="dot") for place in every])
