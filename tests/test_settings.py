@@ -97,7 +97,8 @@ def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorith
     assert own == named
     network = config_io.parse({"task": "cartpole", "model": "log_normal"})
     assert network.model == BNN()
-    assert own.search == network.search == CARTPOLE.search
+    assert own.search == CARTPOLE.search
+    assert network.search == dataclasses.replace(CARTPOLE.search, particles=100)
     for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}):
         assert config_io.parse(words) == config_io.parse({"model": "log_normal", **words})
     swimmer = {"task": "swimmer_corkscrew"}

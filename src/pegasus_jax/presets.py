@@ -210,16 +210,18 @@ def preset(
 ) -> Config:
     """What a command with these words begins with: preset("cartpole") is the config of pegasus-train task=cartpole.
 
-    `model`, `policy` and `algorithm` are the command line's words. A named model, and every algorithm but "pegasus",
-    change the preset NAME_network where there is one: what was tuned for a preset's own model says nothing of another.
+    `model`, `policy` and `algorithm` are the command line's words. A model that is not the preset's own, and every
+    algorithm but "pegasus", change the preset NAME_network where there is one: what was tuned for one says nothing of
+    another.
     Raises ConfigError for an unknown word, in one line with the nearest one.
     """
     said = {"preset": name, "model": model, "policy": policy, "algorithm": algorithm}
     for word, value in said.items():
         if value is not None and value not in WORDS[word]:
             raise ConfigError(f"{word}={value} is unknown; {did_you_mean(value, WORDS[word])}")
-    config = PRESETS[name if model is None and algorithm in (None, "pegasus") else network(name)]
-    for change in (MODELS[model or "log_normal"], ALGORITHMS[algorithm or "pegasus"]):
+    own = model in (None, PRESETS[name].model.kind) and algorithm in (None, "pegasus")
+    config = PRESETS[name if own else network(name)]
+    for change in (MODELS["log_normal" if own else model or "log_normal"], ALGORITHMS[algorithm or "pegasus"]):
         config = change(config)
     return POLICIES[policy](config) if policy else config
 
