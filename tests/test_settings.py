@@ -97,8 +97,8 @@ def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorith
     assert own == named
     network = config_io.parse({"task": "cartpole", "model": "log_normal"})
     assert network.model == BNN()
-    assert own.search == CARTPOLE.search
-    assert network.search == dataclasses.replace(CARTPOLE.search, particles=100)
+    assert network.search == CARTPOLE.search
+    assert own.search == dataclasses.replace(CARTPOLE.search, particles=50)
     for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}):
         assert config_io.parse(words) == config_io.parse({"model": "log_normal", **words})
     swimmer = {"task": "swimmer_corkscrew"}
@@ -107,8 +107,9 @@ def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorith
 
 
 def test_what_suits_a_task_best_is_the_least_of_what_is_said():
-    """Where a model is named the settings chosen with another do not count; a named policy's own do, and words do."""
-    own, named = (config_io.parse({"task": "double_cartpole"} | model) for model in ({}, {"model": "lagrangian"}))
+    """Where another model is named settings chosen for the task do not count; a policy's own and words do."""
+    own, named = (config_io.parse({"task": "double_cartpole"} | model) for model in ({}, {"model": "log_normal"}))
+    assert own == config_io.parse({"task": "double_cartpole", "model": "lagrangian"})
     assert (own.model.substeps, own.search.anneal_trials, own.search.observation_noise, own.explore.trials) == (
         4,
         14,
@@ -116,7 +117,7 @@ def test_what_suits_a_task_best_is_the_least_of_what_is_said():
         4,
     )
     assert (own.model.hidden, own.policy.hidden, own.policy.dropout) == ((32, 32), (50,) * 4, 0)
-    assert (named.model.substeps, named.search.anneal_trials, named.explore.trials) == (2, 1, 2)
+    assert (named.model.hidden, named.search.anneal_trials, named.explore.trials) == ((200,) * 4, 1, 2)
     changed = config_io.parse({"task": "double_cartpole", "policy": "dropout_mlp", "search.anneal_trials": "3"})
     assert (changed.policy.dropout, changed.search.anneal_trials, changed.model) == (0.1, 3, own.model)
     assert config_io.parse({"task": "double_cartpole", "policy": "rbf"}).policy == RBF()
