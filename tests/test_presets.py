@@ -140,7 +140,7 @@ def test_every_setting_is_needed_by_a_preset_a_figure_or_a_page():
 
 
 def test_the_method_has_few_settings():
-    """Beside those that describe a plant of your own, which `Config` has as a group and --help under a title."""
+    """Beside those that describe a plant of your own, which `Config` has as a group and --help=all in groups."""
     plant = {*config_io.used_by()}
     assert len(settings() - plant) <= 55
     assert plant == {

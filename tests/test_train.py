@@ -347,7 +347,7 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(whole: Path) -> None:
 
 
 def test_help_shows_the_settings_that_the_words_beside_it_leave(tmp_path: Path) -> None:
-    shown = {words: call("train", "--help", *words.split(), cwd=tmp_path) for words in ("", "task=gym policy=rbf")}
+    shown = {words: call("train", "--help=all", *words.split(), cwd=tmp_path) for words in ("", "task=gym policy=rbf")}
     own, guest = (done.stdout for done in shown.values())
     assert all(text in own for text in ("search.cost_width_start=2 ", "model.substeps=1 ", "with policy.kind=rbf"))
     assert all(
@@ -358,9 +358,7 @@ def test_help_shows_the_settings_that_the_words_beside_it_leave(tmp_path: Path) 
     assert "did you mean 'gym'" in wrong.stderr
 
 
-@pytest.mark.parametrize(
-    ("name", "words"), [("train", "search.period.dynamics"), ("evaluate", "episodes"), ("plot", "RUN")]
-)
+@pytest.mark.parametrize(("name", "words"), [("evaluate", "episodes"), ("plot", "RUN")])
 def test_help_is_there(name: str, words: str, tmp_path: Path) -> None:
     done = call(name, "--help", cwd=tmp_path)
     assert done.returncode == 0

@@ -23,7 +23,7 @@ interval) and prints what came out, and what that says to the file's claims.
   out=runs/figures      the folder of the studies; NAME is FILE without .toml
   seeds=0-9             instead of the file's; or seeds=0,3,7
   variants=A,B          run only these; all that are there are drawn
-  setting=value         in every variant, instead of the file's; pegasus-train --help lists settings
+  setting=value         in every variant, instead of the file's; pegasus-train --help=all lists settings
 
 a file
   title = "How wide a policy?"

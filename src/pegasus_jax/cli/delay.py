@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from pegasus_jax.checks import ConfigError, whole
 from pegasus_jax.cli.main import main
+from pegasus_jax.cli.words import MORE
 
 DELAY = """\
 pegasus-delay env=ID [amplitude=0.1] [periods=200] [setting=value ...]     measure the delay of a robot. It moves!
@@ -35,10 +36,10 @@ def handle(words: Sequence[str]) -> None:
     """Measure, and say what was found. Raises ConfigError for words that cannot be."""
     from pegasus_jax.runs import config_io
 
-    options, rest = config_io.split(words, ("amplitude", "periods", "most"))
+    options, rest = config_io.split(words, MORE["pegasus-delay"])
     amplitude = _number("amplitude", options.get("amplitude", "0.1"))
     periods, most = (whole(name, options.get(name, default)) for name, default in (("periods", "200"), ("most", "8")))
-    config = config_io.parse({"task": "gym", **rest}, options=("amplitude", "periods", "most"))
+    config = config_io.parse({"task": "gym", **rest}, options=MORE["pegasus-delay"])
     from pegasus_jax.runs.delay import measure, told
 
     print(told(measure(config, amplitude, periods, most)))

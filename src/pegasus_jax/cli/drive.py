@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pegasus_jax.checks import ConfigError, check_range, whole
 from pegasus_jax.cli.main import main
 from pegasus_jax.cli.runs import run_and, trial_of
+from pegasus_jax.cli.words import OF_RUN
 
 RUN = """\
 pegasus-run RUN [trial=best] [episodes=1] [seconds=...] [watchdog=...]     drive the environment of a run by its policy
@@ -34,8 +35,7 @@ def run() -> None:
 
 def handle(words: Sequence[str]) -> None:
     """Drive, and say how each episode went. Raises ConfigError for words that cannot be."""
-    defaults = {"trial": "best", "episodes": "1", "seed": "0", "seconds": "", "watchdog": ""}
-    folder, rest = run_and(words, defaults)
+    folder, rest = run_and(words, OF_RUN["pegasus-run"])
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     seconds, watchdog = (_seconds(name, rest[name]) for name in ("seconds", "watchdog"))
     trial = trial_of(rest["trial"])

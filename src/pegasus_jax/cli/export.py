@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.main import main
 from pegasus_jax.cli.runs import run_and, trial_of
+from pegasus_jax.cli.words import OF_RUN
 
 EXPORT = """\
 pegasus-export RUN [trial=best] [format=numpy] [out=FILE] [overwrite=false]     a policy that runs anywhere
@@ -35,7 +36,7 @@ def export() -> None:
 
 def handle(words: Sequence[str]) -> None:
     """Export a policy, and say how close the file is to it. Raises ConfigError for words that cannot be."""
-    run, rest = run_and(words, {"trial": "best", "format": "numpy", "out": "", "overwrite": "false"})
+    run, rest = run_and(words, OF_RUN["pegasus-export"])
     if rest["overwrite"] not in ("true", "false"):
         raise ConfigError(f"overwrite={rest['overwrite']} is neither true nor false")
     trial = trial_of(rest["trial"])

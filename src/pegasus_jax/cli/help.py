@@ -1,52 +1,48 @@
 """What the commands say of themselves."""
 
+import textwrap
 from collections.abc import Sequence
 
-from pegasus_jax.cli.train import OPTIONS
+from pegasus_jax.checks import ConfigError
 
 TRAIN = """\
 pegasus-train task=NAME [setting=value ...]     learn a controller
-pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that was killed; or with other
-                                                eval_episodes=, fit.* or search.* settings
+pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that was killed
 
-  task=cartpole         what to learn: {tasks}
-  preset=NAME           begin with these settings instead of the task's own, which are preset=TASK: {presets};
-                        or, with the paper's network, cartpole_network, double_cartpole_network, swimmer_..._network
-  model=log_normal      dynamics model: {models}
-                        (default: the one of the task's preset, which learns it best; any other begins with
-                        preset=TASK_network, whose settings do not depend on that one)
-  policy=mlp            controller: {policies}
-  algorithm=pegasus     how to search: {algorithms}
-  out=runs/...          the run's folder (default: runs/TASK-seedN)
-  final=true            run the last policy for one more episode, which is data if the run goes on
-  seeds=1               so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN
-  mesh=SEEDSxPARTICLES  the devices that share seeds and particles (default: as many GPUs, or cores of a CPU, as share
-                        the seeds evenly)
-  distributed=true      started on several hosts at once by SLURM or MPI: their devices act as one machine; without
-                        those, coordinator=HOST:PORT processes=N process=I on each. They share OUT on one file system
+{words}
 
-A preset is a value for each of the settings below, which change it one by one; model=, policy= and algorithm= change
-whole sections of it first. Shown is what they are with the words beside --help:
-pegasus-train task=gym algorithm=paper --help
-
-{settings}
-{others}
-PEGASUS_SETTINGS="fit.steps=5 search.steps=5" in the environment adds these words to every pegasus-train command,
-after those that are typed: of two values of a setting, the last one counts.
+--help=all shows every word, --version --verbose what a report of a problem needs. pegasus-check, with the same words,
+looks at a task and moves nothing. pegasus-completion makes a shell complete the words.
 
 examples
   pegasus-train task=cartpole
   pegasus-train task=cartpole policy.hidden=[50,50] seed=3 trials=10 out=runs/demo
-  pegasus-train task=cartpole seeds=10
-  pegasus-train task=cartpole algorithm=deep_pilco search.grad_clip=1
-  pegasus-train task=swimmer_corkscrew legs=6
   pegasus-train task=gym env=Pendulum-v1 cost=mymodule:cost horizon=40
   pegasus-train task=gym env=robot:Arm-v0 cost=robot:cost start_mean=[3.14,0] eval_episodes=0       (a robot)
   pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
-  pegasus-train resume=runs/demo trials=20 search.steps=2000
+  pegasus-train resume=runs/demo trials=20
 
 Look at a run, finished or not, with pegasus-report RUN, pegasus-watch RUN, pegasus-plot RUN, pegasus-eval RUN or
 pegasus-play RUN; or with tensorboard --logdir RUN/tensorboard, after pip install tensorboard.
+"""
+
+TRAIN_ALL = """\
+pegasus-train task=NAME [setting=value ...]     learn a controller
+pegasus-train resume=RUN [trials=N ...]         go on with a run
+
+A preset is a value for each setting; model=, policy= and algorithm= change whole sections of it, and single settings
+come last. Shown is what they are with the words beside --help=all: pegasus-train task=gym algorithm=paper --help=all
+
+{words}
+
+PEGASUS_SETTINGS="fit.steps=5 search.steps=5" in the environment adds these words to every pegasus-train command,
+after those that are typed: of two values of a setting, the last one counts.
+
+examples
+  pegasus-train task=cartpole seeds=10
+  pegasus-train task=cartpole algorithm=deep_pilco search.grad_clip=1
+  pegasus-train task=swimmer_corkscrew legs=6
+  pegasus-train resume=runs/demo trials=20 search.steps=2000
 """
 
 CHECK = """\
@@ -94,28 +90,41 @@ examples
   pegasus-play runs/cartpole-seed0 episodes=5 seed=1
 """
 
-WORDS = {"-h", "--help", "help"}
+ALL = "--help=all"
+WORDS = {"-h", "--help", "help", ALL}
+
+
+def asked(words: Sequence[str]) -> bool:
+    """Whether help is asked for. Raises ConfigError for help that there is not."""
+    for word in words:
+        if word.startswith("--help=") and word != ALL:
+            raise ConfigError(f"{word} is unknown; did you mean '{ALL}'? choices: --help, {ALL}")
+    return bool(WORDS & {*words})
 
 
 def help_of(text: str, words: Sequence[str]) -> str:
     """A command's help; of its settings as these words leave them. Raises ConfigError for words that cannot be."""
-    if "{settings}" not in text:
+    if "{words}" not in text:
         return text
-    from pegasus_jax.config import KINDS, TASKS
-    from pegasus_jax.presets import ALGORITHMS, MODELS, NETWORKS, POLICIES, PRESETS
+    from pegasus_jax.cli.words import FIRST, OPTIONS, described, grouped
+    from pegasus_jax.config import KINDS
     from pegasus_jax.runs import config_io
 
-    presets = [name for name in PRESETS if name not in NETWORKS]
-    named = dict(tasks=TASKS, presets=presets, models=MODELS, policies=POLICIES, algorithms=ALGORITHMS)
-    lists = {name: ", ".join(values) for name, values in named.items()}
-    _, dotted = config_io.split([word for word in words if word not in WORDS], OPTIONS)
-    config = config_io.parse(dotted, OPTIONS)
-    others = [
-        f"\nwith {section}.kind={kind}, chosen by model=, policy= or algorithm=\n"
-        + "\n".join(config_io.help_lines(default, f"{section}."))
-        + "\n"
-        for section, kinds in KINDS.items()
-        for kind, default in kinds.items()
-        if kind != getattr(config, section).kind
-    ]
-    return text.format(settings=config_io.grouped_help(config), others="".join(others), **lists)
+    _, dotted = config_io.split([word for word in words if word not in WORDS], tuple(OPTIONS))
+    config = config_io.parse(dotted, tuple(OPTIONS))
+    known = described(config)
+    if ALL not in words:
+        return text.format(words="\n".join(line(*known[word]) for word in FIRST))
+    parts = {title: [known[word] for word in of] for title, of in grouped(known).items()}
+    for section, kinds in KINDS.items():
+        for kind, default in kinds.items():
+            if kind != getattr(config, section).kind:
+                title = f"with {section}.kind={kind}, chosen by model=, policy= or algorithm="
+                parts[title] = list(config_io.described(default, f"{section}.").values())
+    whole = ["\n".join([title, *(line(*one) for one in lines)]) for title, lines in parts.items() if lines]
+    return TRAIN_ALL.format(words="\n\n".join(whole))
+
+
+def line(word: str, text: str) -> str:
+    """What help says of a word, in lines of at most 120 characters."""
+    return textwrap.fill(text, 120, initial_indent=f"  {word:34s} ", subsequent_indent=" " * 37, break_on_hyphens=False)

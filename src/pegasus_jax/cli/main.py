@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pegasus_jax import interrupt
 from pegasus_jax.checks import ConfigError, RunError
-from pegasus_jax.cli import help, runs
+from pegasus_jax.cli import help, runs, version
 from pegasus_jax.cli import train as cli_train
 from pegasus_jax.runs import cache, files
 from pegasus_jax.runs.removed import renamed
@@ -96,9 +96,12 @@ def _code(
     """The exit status of a command that nobody stopped."""
     try:
         words = _of_today([*words, *(always() if words else ())])
-        if not words or help.WORDS & {*words}:
+        if not words or help.asked(words):
             print(help.help_of(text, words), end="")
             return 0 if words else 2
+        if version.asked(words):
+            print(version.told(words))
+            return 0
         _remember_compilations()
         command(words)
     except (ConfigError, RunError) as error:

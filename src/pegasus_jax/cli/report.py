@@ -8,6 +8,7 @@ from pathlib import Path
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.main import main
 from pegasus_jax.cli.runs import paths_and
+from pegasus_jax.cli.words import OF_RUN
 
 REPORT = """\
 pegasus-report RUN [out=RUN/report.html] [film=false] [csv=FOLDER]     a run as one HTML file
@@ -36,7 +37,7 @@ def report() -> None:
 
 def handle(words: Sequence[str]) -> None:
     """Write the report of the runs named. Raises ConfigError for words that cannot be."""
-    paths, options = paths_and(words, {"out": "", "film": "false", "csv": ""})
+    paths, options = paths_and(words, OF_RUN["pegasus-report"])
     if options["film"] not in ("true", "false"):
         raise ConfigError(f"film={options['film']} is neither true nor false")
     from pegasus_jax.runs import groups

@@ -6,10 +6,11 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from pegasus_jax.checks import ConfigError, whole
+from pegasus_jax.cli.words import OF_RUN
 
 
 def evaluate(words: Sequence[str]) -> None:
-    run, rest = run_and(words, {"episodes": "20", "seed": "0", "json": "false", "trial": "last", "mjcf": ""})
+    run, rest = run_and(words, OF_RUN["pegasus-eval"])
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     if rest["json"] not in ("true", "false"):
         raise ConfigError(f"json={rest['json']} is neither true nor false")
@@ -23,7 +24,7 @@ def evaluate(words: Sequence[str]) -> None:
 
 
 def plot(words: Sequence[str]) -> None:
-    paths, _ = paths_and(words, {})
+    paths, _ = paths_and(words, OF_RUN["pegasus-plot"])
     if len(paths) > 1:
         raise ConfigError(f"name one run, or one folder of runs, not {len(paths)}; pegasus-report takes several")
     from pegasus_jax.runs import groups, store
@@ -44,7 +45,7 @@ def plot(words: Sequence[str]) -> None:
 
 
 def play(words: Sequence[str]) -> None:
-    run, rest = run_and(words, {"episodes": "1", "seed": "0", "trial": "last", "mjcf": ""})
+    run, rest = run_and(words, OF_RUN["pegasus-play"])
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
     from pegasus_jax.viz.video import film
 

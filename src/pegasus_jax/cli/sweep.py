@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 from pegasus_jax.checks import ConfigError, did_you_mean, whole
 from pegasus_jax.cli.main import main
+from pegasus_jax.cli.words import MORE
 
 SWEEP = """\
 pegasus-sweep task=NAME [setting=value,value,... ...]     learn with every combination of the values
@@ -31,7 +32,7 @@ OUT/SETTING-VALUE_.../seedN, and is checked before the first one starts.
   seeds=, mesh=         of each pegasus-train
   slurm.KEY=VALUE       any option of sbatch: slurm.partition=gpu slurm.time=120 slurm.gpus_per_node=1
 
-local and slurm need the extra `sweep`: pip install 'pegasus-jax[sweep]'. Everything else is as in pegasus-train --help.
+local and slurm need the extra `sweep`: pip install 'pegasus-jax[sweep]'. All else is as in pegasus-train --help=all.
 
 examples
   pegasus-sweep task=cartpole search.grad_clip=1,10,100 seed=0-2
@@ -40,8 +41,8 @@ examples
   pegasus-report runs/sweep     all of its runs side by side
 """
 
-OPTIONS = ("launcher", "jobs", "out", "seeds", "mesh")
-OF_TRAIN = ("seeds", "mesh")  # of those, pegasus-train's
+OF_TRAIN = ("seeds", "mesh")  # options of pegasus-train
+OPTIONS = (*MORE["pegasus-sweep"], "out", *OF_TRAIN)
 MOST = 10_000  # runs of a sweep: beyond is a slip of the keyboard
 YEAR = 365 * 24 * 60  # [min]
 PROGRAM = [sys.executable, "-c", "from pegasus_jax.cli.main import train; train()"]  # pegasus-train, wherever that is

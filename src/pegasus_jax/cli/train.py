@@ -7,23 +7,13 @@ from pathlib import Path
 from typing import Any
 
 from pegasus_jax.checks import ConfigError, whole
+from pegasus_jax.cli.words import NEW
+from pegasus_jax.cli.words import OPTIONS as WORDS
 from pegasus_jax.config import Search
 from pegasus_jax.runs import start
 from pegasus_jax.runs.start import Asked
 
-OPTIONS = (
-    "out",
-    "resume",
-    "final",
-    "seeds",
-    "mesh",
-    "distributed",
-    "coordinator",
-    "processes",
-    "process",
-)  # of pegasus-train
-
-NEW = ("out", "seeds")  # of these, those of a new run
+OPTIONS = tuple(WORDS)  # words that are no settings
 
 begun: list[Path] = []  # the folder of what this process learns, for whoever stops it
 

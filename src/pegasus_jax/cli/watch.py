@@ -6,6 +6,7 @@ from pegasus_jax.checks import ConfigError, check_range
 from pegasus_jax.cli.main import main
 from pegasus_jax.cli.report import on_cpu
 from pegasus_jax.cli.runs import paths_and
+from pegasus_jax.cli.words import OF_RUN
 
 WATCH = """\
 pegasus-watch RUN|FOLDER ... [port=8765]     the report of a run while it learns
@@ -26,7 +27,7 @@ def watch() -> None:
 
 def handle(words: Sequence[str]) -> None:
     """Serve the page until a signal ends it. Raises ConfigError for words, and a port, that cannot be."""
-    paths, options = paths_and(words, {"port": "8765"})
+    paths, options = paths_and(words, OF_RUN["pegasus-watch"])
     if not options["port"].isdecimal():
         raise ConfigError(f"port={options['port']} is not a whole number; for example port=8765")
     check_range("port", port := int(options["port"]), 0, 65535)

@@ -145,24 +145,16 @@ def plain(config: Config) -> dict[str, Any]:
     }
 
 
-def help_lines(node: Any, prefix: str = "") -> list[str]:
-    """One line a setting: name=default and what it is for."""
-    lines: list[str] = []
+def described(node: Any, prefix: str = "") -> dict[str, tuple[str, str]]:
+    """Setting -> name=default and what it is for; without those that select what a command begins with."""
+    found: dict[str, tuple[str, str]] = {}
     for f in dataclasses.fields(node):
-        value = getattr(node, f.name)
+        value, name = getattr(node, f.name), prefix + f.name
         if dataclasses.is_dataclass(value):
-            lines += help_lines(value, f"{prefix}{f.name}.")
-        elif f"{prefix}{f.name}" not in NAMED and f.metadata["help"]:
-            lines.append(f"  {prefix + f.name + '=' + shown(value):34s} {f.metadata.get('help', '')}")
-    return lines
-
-
-def grouped_help(config: Config) -> str:
-    """The lines of `help_lines` under two titles: the settings of the method, and those of a plant of your own."""
-    plant = [line for line in help_lines(config) if line.split("=")[0].strip() in used_by()]
-    method = [line for line in help_lines(config) if line not in plant]
-    titled = {"the method": method, "the plant, where a task leaves it to you": plant}
-    return "\n\n".join("\n".join([title, *lines]) for title, lines in titled.items())
+            found |= described(value, f"{name}.")
+        elif name not in NAMED and f.metadata["help"]:
+            found[name] = (f"{name}={shown(value)}", f.metadata["help"])
+    return found
 
 
 def save(config: Config, path: Path) -> None:
@@ -204,7 +196,7 @@ def stored_config(stored: dict[str, Any]) -> Config:
 def _hint(key: str, choices: Sequence[str]) -> str:
     """The nearest choice; all of them only when they are few."""
     text = did_you_mean(key, choices).removesuffix(f"choices: {', '.join(choices)}")
-    return f"{text}--help lists all settings"
+    return f"{text}--help=all lists all settings"
 
 
 def _value(key: str, text: str) -> Any:

@@ -22,20 +22,22 @@ def about(command: str) -> dict[str, Any]:
     import jax
 
     packages = ("pegasus-jax", "jax", "jaxlib", "flax", "optax", "mujoco", "mujoco-mjx", "orbax-checkpoint", "numpy")
-    versions = {}
-    for name in packages:
-        try:
-            versions[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            versions[name] = "not installed"
     return {
         "command": command,
         "python": sys.version.split()[0],
         "platform": platform.platform(),
         "processor": ", ".join(f"{label}{cpu()[name]}" for name, label in NAMED.items() if name in cpu()),
         "devices": [str(device) for device in jax.devices()],
-        "versions": versions,
+        "versions": {name: installed(name) for name in packages},
     }
+
+
+def installed(name: str) -> str:
+    """The version of a package, or that there is none."""
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "not installed"
 
 
 # What tells CPUs apart: a virtual machine may call two generations by one name.
