@@ -119,10 +119,10 @@ def test_zsh_completes(folder: Path) -> None:
     start = "PS1='> '; autoload -Uz compinit; compinit -D; source ./words.zsh; echo rea'dy'\n"
     import pty  # Windows has none, nor a zsh
 
-    child, terminal = pty.fork()
-    if not child:
-        os.chdir(folder)
-        os.execvpe("zsh", ["zsh", "-f", "-i"], {**os.environ, "TERM": "dumb", "HOME": str(folder)})
+    terminal, inside = pty.openpty()
+    environment = {**os.environ, "TERM": "dumb", "HOME": str(folder)}
+    ends = dict(stdin=inside, stdout=inside, stderr=inside)
+    shell = subprocess.Popen(["zsh", "-f", "-i"], cwd=folder, env=environment, start_new_session=True, **ends)
     try:
         os.write(terminal, start.encode())
         heard(terminal, "ready")
@@ -132,8 +132,10 @@ def test_zsh_completes(folder: Path) -> None:
             os.write(terminal, f"\x15{typed}\t".encode())
             heard(terminal, typed.rpartition(" ")[0] + " " + line.replace(" ", "\\ "))
     finally:
+        shell.kill()
+        shell.wait()
         os.close(terminal)
-        os.waitpid(child, 0)
+        os.close(inside)
 
 
 def heard(terminal: int, text: str) -> None:

@@ -123,11 +123,15 @@ def test_what_close_raises_is_said_and_does_not_keep_the_command(capfd: pytest.C
     assert "pegasus: closing the environment failed, OSError: no answer" in capfd.readouterr().err
 
 
-def test_an_error_does_not_wait_for_the_other_thread() -> None:
+@pytest.mark.parametrize("code", [0, 2])
+def test_an_end_does_not_wait_for_the_threads_of_others(code: int) -> None:
+    """A robot's driver, or a tracker, may have one that never ends."""
     program = COMMAND.format(body="pass", closing="pass", before="")
     began = time.monotonic()
-    done = subprocess.run([sys.executable, "-c", program, "2"], capture_output=True, text=True, check=False, timeout=30)
-    assert (done.returncode, done.stdout.split()) == (2, ["ready", "closing", "closed"])
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(code)], capture_output=True, text=True, check=False, timeout=30
+    )
+    assert (done.returncode, done.stdout.split()) == (code, ["ready", "closing", "closed"])
     assert time.monotonic() - began < 20
 
 

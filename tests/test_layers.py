@@ -24,7 +24,8 @@ LAYERS = {
     6: "assembly. logs.",
     7: "runs.",
     8: "viz. exports. report.",
-    9: "cli. deploy __init__",
+    9: "start",
+    10: "cli. deploy __init__",
 }
 APPLICATION = 7  # the first layer that knows of files, terminals and people
 
@@ -184,7 +185,7 @@ ROLLOUT = "imagine.rollout (layer 3) imports"
         ("imagine/rollout.py", "from pegasus_jax.learn.search import a\n", f"{ROLLOUT} learn.search (layer 4)"),
         ("imagine/rollout.py", "from ..learn.search import a\n", f"{ROLLOUT} learn.search (layer 4)"),
         ("imagine/rollout.py", "def f():\n    import pegasus_jax.learn.search\n", f"rollout.py:2: {ROLLOUT} learn"),
-        ("imagine/rollout.py", "from pegasus_jax import gradient_search\n", f"{ROLLOUT} __init__ (layer 9)"),
+        ("imagine/rollout.py", "from pegasus_jax import gradient_search\n", f"{ROLLOUT} __init__ (layer 10)"),
         ("imagine/rollout.py", "if TYPE_CHECKING:\n    from ..models.bnn import b\n", f"{ROLLOUT} models.bnn"),
         (
             "math/angles.py",

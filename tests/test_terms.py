@@ -21,7 +21,7 @@ from pegasus_jax.runs import config_io, facts
 from pegasus_jax.runs.check import before_training
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.runs.restore import restored
-from pegasus_jax.runs.start import train
+from pegasus_jax.start import train
 from pegasus_jax.tasks import signals, starts, terms
 from pegasus_jax.types import Cost
 from probes import cart, tiny

@@ -81,6 +81,7 @@ def test_a_run_leaves_everything(whole: Path) -> None:
     assert all(row["calibration"] > 0 for row in rows[1:])
     assert sum(row["seconds"]["compile"] for row in rows[1:]) == 0  # nothing recompiles from trial to trial
     assert list((whole / "tensorboard").glob("events*"))
+    assert not (whole / "tracked.json").exists()  # it asks for no trackers
     about = json.loads((whole / "run.json").read_text())
     assert "task=cartpole" in about["command"]
     assert "jax" in about["versions"]
@@ -89,8 +90,9 @@ def test_a_run_leaves_everything(whole: Path) -> None:
 @pytest.mark.slow
 def test_nothing_is_learned_between_random_episodes(tmp_path: Path) -> None:
     run = tmp_path / "run"
-    done = call("train", *TINY, "explore.trials=2", f"out={run}", cwd=tmp_path)
+    done = call("train", *TINY, "explore.trials=2", "track=tensorboard", f"out={run}", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
+    assert json.loads((run / "tracked.json").read_text()) == {"tensorboard": {"known": {}, "told": 3}}
     rows = store.trials(run)
     assert [row["fit_loss"] is None for row in rows] == [True, False, False]
     assert [row["objective_last"] is None for row in rows] == [True, False, False]

@@ -47,7 +47,7 @@ def unwritten(job: Job) -> RunState:
 @pytest.mark.slow
 def test_folders_hold_what_is_learned_without_them(job: Job, unwritten: RunState, tmp_path) -> None:
     runs = {seed: tmp_path / f"seed{seed}" for seed in SEEDS}
-    states = learned(job, writers.run_folders(runs, CONFIG, job.experiment.task, "", print))
+    states = learned(job, writers.run_folders(runs, CONFIG, job.experiment.task, ""))
     assert same(states.policy.params, unwritten.policy.params)
     assert same(states.data, unwritten.data)
     like = jax.eval_shape(job.experiment.init, jax.random.key(0))
@@ -63,7 +63,7 @@ def test_a_study_keeps_the_rows_of_the_folders(job: Job, unwritten: RunState, tm
     states = learned(job, one_json(CONFIG, SEEDS, job.experiment.task, handed.append))
     assert same(states.policy.params, unwritten.policy.params)
     runs = {seed: tmp_path / f"seed{seed}" for seed in SEEDS}
-    learned(job, writers.run_folders(runs, CONFIG, job.experiment.task, "", print))
+    learned(job, writers.run_folders(runs, CONFIG, job.experiment.task, ""))
     rows = [store.trials(folder) for folder in runs.values()]
     assert [np.shape(result["mean_cost"]) for result in handed] == [(2, 1), (2, 2)]
     for name in ("mean_cost", "episode_cost", "objective_last", "objective_fresh", "saturated", "calibration"):

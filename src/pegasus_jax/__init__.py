@@ -64,8 +64,8 @@ if TYPE_CHECKING:
     from pegasus_jax.policies.wrap import of_pair as of_pair
     from pegasus_jax.runs.controller import Controller as Controller
     from pegasus_jax.runs.controller import controller as controller
-    from pegasus_jax.runs.start import preset as preset
-    from pegasus_jax.runs.start import train as train
+    from pegasus_jax.start import preset as preset
+    from pegasus_jax.start import train as train
     from pegasus_jax.task import Signal as Signal
     from pegasus_jax.task import Task as Task
     from pegasus_jax.types import Batch as Batch
@@ -91,7 +91,7 @@ if TYPE_CHECKING:
 _NAMES = {
     # a run, from settings
     "config": "Config",
-    "runs.start": "preset train",
+    "start": "preset train",
     "logs.read": "load_logs",
     "assembly.experiments": "build compose",
     "assembly.pieces": "dynamics_of policy_of",

@@ -16,6 +16,7 @@ from typing import Any
 # Windows has no SIGHUP.
 SIGNALS = tuple(signal.Signals[n] for n in ("SIGINT", "SIGTERM", "SIGHUP") if n in signal.Signals.__members__)
 
+WAITED = "compiling"  # the name of threads that the end of a success waits for: the compiler cannot be stopped
 PAUSE = 0.02  # seconds until a signal whose exception was lost, or could not be raised, is raised again
 LOADING = ("create_module", "exec_module")  # of a loader
 
@@ -119,9 +120,9 @@ def status() -> int:
 
 
 def end(code: int) -> None:
-    """End the process with this status: what still compiles or computes is waited for by a success only."""
+    """End the process with this status: what still compiles is waited for by a success only, others' threads never."""
     for thread in threading.enumerate() if code == 0 else ():
-        if thread.daemon:
+        if thread.name == WAITED:
             thread.join()
     for stream in (sys.stdout, sys.stderr):
         with contextlib.suppress(OSError, ValueError):  # nobody reads it any more

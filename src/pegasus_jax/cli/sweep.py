@@ -29,7 +29,7 @@ OUT/SETTING-VALUE_.../seedN, and is checked before the first one starts.
            slurm        hand them to SLURM as one job array, jobs= at a time, and return
   jobs=2                how many run at once
   out=runs/sweep        the folder of all runs; OUT/jobs has what local and slurm jobs printed
-  seeds=, mesh=         of each pegasus-train
+  seeds=, mesh=, track= of each pegasus-train; several trackers in brackets
   slurm.KEY=VALUE       any option of sbatch: slurm.partition=gpu slurm.time=120 slurm.gpus_per_node=1
 
 local and slurm need the extra `sweep`: pip install 'pegasus-jax[sweep]'. All else is as in pegasus-train --help=all.
@@ -41,7 +41,7 @@ examples
   pegasus-report runs/sweep     all of its runs side by side
 """
 
-OF_TRAIN = ("seeds", "mesh")  # options of pegasus-train
+OF_TRAIN = ("seeds", "mesh", "track")  # options of pegasus-train
 OPTIONS = (*MORE["pegasus-sweep"], "out", *OF_TRAIN)
 MOST = 10_000  # runs of a sweep: beyond is a slip of the keyboard
 YEAR = 365 * 24 * 60  # [min]

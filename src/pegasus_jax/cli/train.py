@@ -6,12 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pegasus_jax import start
 from pegasus_jax.checks import ConfigError, whole
 from pegasus_jax.cli.words import NEW
 from pegasus_jax.cli.words import OPTIONS as WORDS
 from pegasus_jax.config import Search
-from pegasus_jax.runs import start
-from pegasus_jax.runs.start import Asked
+from pegasus_jax.runs import trackers
+from pegasus_jax.start import Asked
 
 OPTIONS = tuple(WORDS)  # words that are no settings
 
@@ -40,7 +41,8 @@ def understood(words: Sequence[str]) -> tuple[Asked, dict[str, str]]:
         asked = start.new(config, options.get("out"), whole("seeds", options.get("seeds", "1")))
     if options.get("final", "false") not in ("true", "false"):
         raise ConfigError(f"final={options['final']} is neither true nor false")
-    return asked._replace(final=options.get("final") == "true"), options
+    track = trackers.asked(options.get("track"))
+    return asked._replace(final=options.get("final") == "true", track=track), options
 
 
 def _configured(asked: Asked, options: dict[str, str]) -> Any:
@@ -62,6 +64,7 @@ def check(words: Sequence[str]) -> None:
     if "resume" in options:
         raise ConfigError(f"resume={options['resume']} was checked when it began; give the words of a new run")
     config = config_io.parse(rest, options=OPTIONS)
+    trackers.asked(options.get("track"))
     from pegasus_jax.runs.check import report
 
     print("\n".join(report(config)))

@@ -21,6 +21,11 @@ OPTIONS = {
         "go on with a run, also one that was killed; trials=, eval_episodes=, fit.* and search.* may change",
     ),
     "final": ("final=true", "run the last policy for one more episode, which is data if the run goes on"),
+    "track": (
+        "track=tensorboard",
+        "where numbers, settings and pictures also go: tensorboard, wandb, mlflow, several as wandb,mlflow, or none"
+        " (default: the numbers to tensorboard; of a run that goes on, where they went)",
+    ),
     "seeds": ("seeds=1", "so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN"),
     "mesh": (
         "mesh=SEEDSxPARTICLES",
@@ -61,7 +66,7 @@ FIRST = (
 )
 # Who asks for a word: the first group that has it.
 GROUPS: dict[str, tuple[str, ...]] = {
-    "everybody": ("task", "preset", "out", "resume", "trials", "seed", "final", "eval_episodes"),
+    "everybody": ("task", "preset", "out", "resume", "trials", "seed", "final", "eval_episodes", "track"),
     "who has a robot, or an environment of Gymnasium": (
         *(
             "env",
@@ -91,6 +96,7 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "model": tuple(MODELS),
     "policy": tuple(POLICIES),
     "algorithm": tuple(ALGORITHMS),
+    "track": ("tensorboard", "wandb", "mlflow", "none"),
     "legs": limits.LEGS,
     "successor": limits.SUCCESSORS,
     "data_control": limits.DATA_CONTROLS,

@@ -193,7 +193,7 @@ def begun(function: Callable[..., Any], *arguments: Any) -> Future:
         except BaseException as error:
             coming.set_exception(error)
 
-    Thread(target=work, daemon=True).start()
+    Thread(target=work, name=interrupt.WAITED, daemon=True).start()
     return coming
 
 

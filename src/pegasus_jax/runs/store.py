@@ -12,6 +12,7 @@
         trials.jsonl         one JSON object a trial
         checkpoints/0001/    the state after trial 1, with 0001.json: the SHA-256 of each of its files
         tensorboard/         the numbers of trials.jsonl as scalars
+        tracked.json         of trackers that were asked for (tracked.py), and wandb/, the files of one
         driven/0001.npz      of pegasus-run, never data: as an episode, with when each control was sent, and overruns
         report.html          of pegasus-report, made of the files above; play.mp4 of pegasus-play
         controller.py        and .h, .onnx, .stablehlo: of pegasus-export, each with its contract, controller.py.json
@@ -42,11 +43,11 @@ if TYPE_CHECKING:  # JAX is imported where it is needed: a command names its fol
     from pegasus_jax.task import Task
     from pegasus_jax.types import Rollout, Trajectory
 
-FILES = ("config.yaml", "run.json", "trials.jsonl", ".lock")
+FILES = ("config.yaml", "run.json", "trials.jsonl", "tracked.json", ".lock")
 FOLDERS = ("episodes", "logged", "imagined", "checkpoints", "tensorboard", "plots")
 # What a killed process was writing (files.beside, orbax), and pegasus-play.
 UNFINISHED = re.compile(
-    r"\.(\d{4,}\.(npz|json)|trials\.jsonl|run\.json|config\.yaml|learning\.png|report\.html|trial_\d{4,}\.png)"
+    r"\.(\d{4,}\.(npz|json)|trials\.jsonl|(run|tracked)\.json|config\.yaml|learning\.png|report\.html|trial_\d{4,}\.png)"
     r"\.\w{8}|\.play\.\w{8}|\d{4,}\.orbax-checkpoint-tmp.*"
 )
 EPISODE = ("x", "u", "cost", "task", "trial", "policy", "ended", "horizon")  # what every episode's file has

@@ -22,7 +22,7 @@ from pegasus_jax.experiment import EVALUATE, trial_key
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.logs.read import Logged
-from pegasus_jax.runs import begin, checkpoint, config_io, logged, restore, store, writers
+from pegasus_jax.runs import begin, checkpoint, config_io, logged, restore, store, tracked, writers
 from pegasus_jax.runs.collect import collected, stacked
 from pegasus_jax.runs.display import learned
 from pegasus_jax.runs.evaluation import UNMEASURED, evaluate, kept_to, saturated
@@ -66,6 +66,8 @@ def train_seeds(
     final: bool = False,
     mesh: Mesh | None = None,
     logs: Sequence[Logged] | None = None,
+    track: tuple[str, ...] | None = None,
+    draw: tracked.Draw | None = None,
 ) -> RunState:
     """`train` for the seeds and folders of `runs`, all as one program; returns their states [S, ...].
 
@@ -73,7 +75,8 @@ def train_seeds(
     clock: one that diverges leaves the others as they are. All go on from the newest trial that all have finished.
     With a `mesh` (sharding.py) of several devices the seeds are shared out among them; where several processes hold the
     devices, all call this together, see the same files, and the first one writes. `logs` are the episodes of the
-    config's `data`, None where they are to be read; a run that goes on has copies of them.
+    config's `data`, None where they are to be read; a run that goes on has copies of them. `track` are the trackers
+    that are also told, with the pictures that `draw` draws; None: those of before, or the usual one (tracked.py).
     """
     folders = list(runs.values())
     with ExitStack() as held:
@@ -86,6 +89,7 @@ def train_seeds(
         if config.trials < before.trials:
             raise ConfigError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
         begun = logged.of_run(config, folders[0]) if resume else logged.of_config(config, logs)
+        closing = held.enter_context(ExitStack())  # of what may wait for a network: a robot is let go before
         job = held.enter_context(opened(config, list(runs), mesh, begun))
         task, say = job.experiment.task, job.display.line
         for run in folders if begun.rows and not resume and is_main_process() else ():
@@ -103,7 +107,8 @@ def train_seeds(
             states = begin.begun(states, config, folders[0])
         job.display.done += zip(*(store.readable_trials(run)[0][: int(done or 0)] for run in folders), strict=False)
         multihost_utils.sync_global_devices("every process has read what there is")
-        job = job._replace(writer=writers.run_folders(runs, config, task, command, say))
+        others = tracked.writer(runs, config, task, track, draw, say, closing)
+        job = job._replace(writer=writers.together(writers.run_folders(runs, config, task, command), others))
         states = learn(job, states, done)
         if final:
             collected(job, states, config.trials + 1)

@@ -1,7 +1,7 @@
 """Where the results of a job go: a `Writer` is a value, so the loop of Alg. 1 (train.py) knows of no files.
 
 `run_folders` keeps everything in a folder per seed (store.py), `nothing` keeps nothing; a study's writer, which makes
-one JSON of all seeds, is in runs/study.py.
+one JSON of all seeds, is in runs/study.py, that of trackers in runs/tracked.py.
 """
 
 import sys
@@ -18,7 +18,6 @@ from pegasus_jax.episode import Episode
 from pegasus_jax.experiment import Successor
 from pegasus_jax.runs import checkpoint, config_io, store
 from pegasus_jax.runs.programs import gather, is_main_process
-from pegasus_jax.runs.tensorboard import Board
 from pegasus_jax.task import Task
 from pegasus_jax.types import RunState
 
@@ -54,20 +53,18 @@ def nothing(seeds: int) -> Writer:
     )
 
 
-def run_folders(runs: dict[int, Path], config: Config, task: Task, command: str, say: Callable[[str], None]) -> Writer:
+def run_folders(runs: dict[int, Path], config: Config, task: Task, command: str) -> Writer:
     """Everything in a folder per seed, `runs`, so that each can be resumed (store.py says what is in it).
 
-    Called by who holds the folders' locks. `command` is what the user typed, `say` prints a line.
+    Called by who holds the folders' locks. `command` is what the user typed.
     """
     folders = list(runs.values())
-    boards: list[Board] = []
 
     def begin(done: int) -> None:
         for seed, run in runs.items() if is_main_process() else ():
             config_io.save(replace(config, seed=seed), run / "config.yaml")
             store.note(run, command, done, task)
             store.write_trials(run, store.readable_trials(run)[0][:done])
-            boards.append(Board(run / "tensorboard", done + 1, say))
 
     def ready(states: RunState) -> None:
         whole = gather(states)
@@ -84,10 +81,9 @@ def run_folders(runs: dict[int, Path], config: Config, task: Task, command: str,
 
     def trial(number: int, states: RunState, rows: list[Row]) -> None:
         whole = gather(states)
-        for index, board in enumerate(boards):
-            store.write_trials(folders[index], [*store.trials(folders[index]), rows[index]])
-            board.add(rows[index])
-            checkpoint.save(folders[index], number, part(whole, index))
+        for index, run in enumerate(folders if is_main_process() else ()):
+            store.write_trials(run, [*store.trials(run), rows[index]])
+            checkpoint.save(run, number, part(whole, index))
 
     return Writer(
         begin=begin,
@@ -100,6 +96,19 @@ def run_folders(runs: dict[int, Path], config: Config, task: Task, command: str,
         advice=lambda index: f"; resume={folders[index]} goes on",
         problem=refuse,
     )
+
+
+def together(first: Writer, second: Writer) -> Writer:
+    """Both keep what is learned, the first one before the second; what is asked is answered by the first."""
+
+    def both(name: str) -> Callable[..., None]:
+        def call(*given: Any) -> None:
+            for writer in (first, second):
+                getattr(writer, name)(*given)
+
+        return call
+
+    return first._replace(**{name: both(name) for name in ("begin", "ready", "episode", "imagined", "trial")})
 
 
 def refuse(text: str) -> NoReturn:

@@ -38,6 +38,18 @@ def run_pictures(run: Path, task: Task) -> list[Path]:
     return paths
 
 
+def trial_pictures(run: Path, task: Task, trial: int) -> dict[str, Path]:
+    """Draw the learning curve, and what was imagined after the trial before, if a policy was searched, with this
+    trial's episode over it."""
+    found = {"learning": run / "plots" / "learning.png"}
+    learning(trials(run)[:trial], found["learning"])
+    fan = load_imagined(run, trial - 1)
+    if fan is not None:
+        found["imagined_and_real"] = run / "plots" / f"trial_{trial - 1:04d}.png"
+        trajectories(run, trial - 1, fan, task, found["imagined_and_real"])
+    return found
+
+
 def learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Cost and success against seconds of plant time, raw: no smoothing, no best so far.
 

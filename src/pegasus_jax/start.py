@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from pegasus_jax.checks import SIZES, ConfigError, check_range
 from pegasus_jax.config import Config, label
+from pegasus_jax.runs import trackers
 
 Mesh = Any  # a jax.sharding.Mesh; None: one device
 
@@ -25,6 +26,7 @@ class Asked(NamedTuple):
     resumed: Path | None = None  # of a run that goes on, its folder, or the first one's
     mjcf: str | None = None  # where the file of a run that goes on is now
     final: bool = False  # whether the last policy runs once more
+    track: tuple[str, ...] | None = None  # the trackers; None: those of before
 
 
 def preset(
@@ -58,6 +60,7 @@ def train(
     final: bool = False,
     mesh: Mesh = None,
     data: str | Sequence[str] | None = None,
+    track: str | Sequence[str] | None = None,
 ) -> Path:
     """Learn what `pegasus-train` would, by the same loop and with the same files; returns the run's folder.
 
@@ -70,6 +73,7 @@ def train(
     final: whether the last policy runs for one more episode
     data: files or patterns of logs that the run begins with, as the setting `data`
     mesh: the devices that share seeds and particles (sharding.py); None: as many as share the seeds evenly
+    track: where numbers, settings and pictures also go, as the command's word: "wandb", ("wandb", "mlflow") or "none"
 
     Raises ConfigError for what cannot be, and RunError where a run cannot go on. JAX has the config's precision while
     it runs; its devices are the caller's.
@@ -82,8 +86,9 @@ def train(
         asked = going_on(Path(resume), given)
     else:
         raise ConfigError(f"resume={resume} goes on with a run; leave out config and out")
+    asked = asked._replace(final=final, track=trackers.asked(track))
     with _precision_kept():
-        start(asked._replace(final=final), "pegasus_jax.train", lambda: mesh or _evenly(len(asked.runs)))
+        start(asked, "pegasus_jax.train", lambda: mesh or _evenly(len(asked.runs)))
     return asked.home
 
 
@@ -159,9 +164,16 @@ def start(asked: Asked, command: str, configure: Callable[[], Mesh]) -> None:
         for run in asked.runs.values():
             store.create(run)
     told: dict[str, Any] = dict(command=command, final=asked.final, mesh=mesh, logs=logs)
+    told |= dict(track=asked.track, draw=_pictures)
     train_seeds(config, asked.runs, resume=asked.resumed is not None, **told)
     if is_main_process():
         _summed_up(asked)
+
+
+def _pictures(run: Path, task: Any, trial: int) -> Mapping[str, Path]:
+    from pegasus_jax.viz.run_plots import trial_pictures
+
+    return trial_pictures(run, task, trial)
 
 
 def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
