@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+import json
+import os
 import re
+import shutil
 import subprocess
 import sys
 import tomllib
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from pegasus_jax.cli.train import understood
+
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+MINORS = [found for line in PROJECT["classifiers"] for found in re.findall(r"Python :: (3\.\d+)$", line)]
 LOCK = (ROOT / "requirements.lock").read_text()
 PACKAGES = {"pegasus_jax": ROOT / "src" / "pegasus_jax", "pegasus_envs": ROOT / "envs" / "pegasus_envs"}
 
@@ -55,7 +63,8 @@ def test_wheel_holds_both_packages_and_their_assets(wheel: zipfile.ZipFile) -> N
 
 def test_wheel_holds_nothing_else(wheel: zipfile.ZipFile) -> None:
     tops = {name.split("/")[0] for name in wheel.namelist()}
-    assert tops == {*PACKAGES, f"pegasus_jax-{PROJECT['version']}.dist-info"}
+    (about,) = tops - {*PACKAGES}
+    assert re.fullmatch(r"pegasus_jax-\d+\.\d+\.\d+.*\.dist-info", about)
     assert any(name.endswith("licenses/LICENSE") for name in wheel.namelist())
 
 
@@ -105,8 +114,108 @@ def test_users_do_not_install_what_only_developers_need() -> None:
     assert not runtime & developer
 
 
-def test_citation_has_the_version() -> None:
-    assert f"\nversion: {PROJECT['version']}\n" in (ROOT / "CITATION.cff").read_text()
+def test_the_citation_is_of_the_newest_release() -> None:
+    release = r"^## \[(\d+\.\d+\.\d+)\] - (\d{4}-\d\d-\d\d)$"
+    version, date = re.findall(release, (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)[0]
+    assert f"\nversion: {version}\ndate-released: {date}\n" in (ROOT / "CITATION.cff").read_text()
+    assert PROJECT["dynamic"] == ["version"]
+
+
+def others() -> list[str]:
+    """Interpreters of the other Pythons that are supported, of those that are here."""
+    found = [shutil.which(f"python{minor}") for minor in MINORS]
+    managed = Path.home() / ".pyenv" / "versions"
+    found += [str(path) for minor in MINORS for path in managed.glob(f"{minor}.*/bin/python3")]
+    here = f"{sys.version_info.major}.{sys.version_info.minor}"
+    asked = {path: told(path) for path in found if path}
+    return [*{minor: path for path, minor in asked.items() if minor in MINORS and minor != here}.values()]
+
+
+def told(python: str) -> str:
+    code = "import sys, ensurepip; print('%d.%d' % sys.version_info[:2])"
+    return subprocess.run([python, "-c", code], capture_output=True, text=True).stdout.strip()
+
+
+def learns(python: str, wheel: zipfile.ZipFile, folder: Path) -> None:
+    """Install the wheel by pip alone into an empty environment, and learn there, far from the sources."""
+    alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    bare = folder / "bare" / ("Scripts" if os.name == "nt" else "bin")
+
+    def run(*command: object) -> str:
+        done = subprocess.run([*map(str, command)], cwd=folder, env=alone, capture_output=True, text=True)
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    run(python, "-m", "venv", bare.parent)
+    run(bare / "pip", "install", "--quiet", "--no-compile", wheel.filename)
+    small = ["model.hidden=[8]", "policy.hidden=[8]", "fit.steps=3", "search.steps=4", "eval_episodes=1"]
+    said = run(bare / "pegasus-train", "task=cartpole", "preset=cartpole_network", "trials=1", "out=demo", *small)
+    assert "done: demo" in said
+    assert f"pegasus-jax {Path(str(wheel.filename)).name.split('-')[1]}\n" == run(bare / "pegasus-eval", "--version")
+
+
+@pytest.mark.slow
+def test_the_wheel_learns_in_an_empty_environment(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    learns(sys.executable, wheel, tmp_path)
+
+
+@pytest.mark.campaign
+def test_the_wheel_learns_with_the_other_pythons(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    found = others()
+    if not found:
+        pytest.skip("no other Python is here")
+    for index, python in enumerate(found):
+        (tmp_path / str(index)).mkdir()
+        learns(python, wheel, tmp_path / str(index))
+
+
+# What GitHub reads
+
+
+def workflow(name: str) -> dict[str, Any]:
+    return yaml.safe_load((ROOT / ".github" / "workflows" / f"{name}.yml").read_text())
+
+
+@pytest.mark.parametrize("name", ["ci", "release"])
+def test_a_workflow_has_its_form_and_runs_what_there_is(name: str) -> None:
+    found = workflow(name)
+    assert found["permissions"] == {"contents": "read"}
+    for job in found["jobs"].values():
+        assert {*job.get("needs", "").split()} <= {*found["jobs"]}
+        for step in job["steps"]:
+            assert ("run" in step) != ("uses" in step)
+            assert re.fullmatch(r"[\w-]+/[\w-]+@(v\d+|release/v1)", step.get("uses", "a/b@v1"))
+            for line in step.get("run", "").splitlines():
+                for command, words in re.findall(r"\b(pegasus-\w+)\"? (.*)", line):
+                    assert command in PROJECT["scripts"]
+                    if command == "pegasus-train" and "--" not in words:
+                        understood(words.split())
+    tests = re.findall(r"tests/\w+\.py|\.ci/run", str(found))
+    assert all((ROOT / path).is_file() for path in tests)
+
+
+def test_ci_has_three_pythons_and_three_systems_and_a_tag_releases() -> None:
+    ci, release = workflow("ci"), workflow("release")
+    matrix = ci["jobs"]["installed"]["strategy"]["matrix"]
+    assert matrix["python"] == MINORS
+    assert len(matrix["os"]) == 3
+    systems = [line for line in PROJECT["classifiers"] if line.startswith("Operating System")]
+    assert len(systems) == 3
+    assert release[True] == {"push": {"tags": ["v*"]}}  # `on` is a truth value in YAML
+    assert [name for name, job in release["jobs"].items() if "id-token" in job.get("permissions", {})] == ["publish"]
+
+
+def test_issues_ask_for_the_versions_and_containers_are_of_files_that_are_there() -> None:
+    templates = [path for path in (ROOT / ".github" / "ISSUE_TEMPLATE").iterdir() if path.stem != "config"]
+    assert len(templates) == 2
+    for path in templates:
+        asked = [field["attributes"]["label"] for field in yaml.safe_load(path.read_text())["body"]]
+        assert "Output of `pegasus-train --version --verbose`" in asked
+    container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
+    assert "make setup" in container["postCreateCommand"]
+    assert re.findall(r'^CMD \["(\S+)"', (ROOT / "Dockerfile").read_text(), re.MULTILINE) == ["pegasus-train"]
+    cited = {*re.findall(r"@(\w+20\d\d|\w+18)", (ROOT / "paper.md").read_text())}
+    assert cited == {*re.findall(r"^@\w+\{(\w+),", (ROOT / "paper.bib").read_text(), re.MULTILINE)}
 
 
 def tracked() -> list[Path]:

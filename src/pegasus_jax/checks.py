@@ -6,6 +6,7 @@ import math
 import numbers
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from pathlib import PureWindowsPath
 from types import GenericAlias, UnionType
 from typing import Any, get_args
 
@@ -126,6 +127,11 @@ def pairs(name: str, values: tuple[tuple[int, ...], ...]) -> None:
         if len(pair) != 2:
             raise ConfigError(f"{name}={shown(values)} are not pairs; for example {name}=[[0,1]]")
     different(name, tuple(entry for pair in values for entry in pair))
+
+
+def names_code(value: Any) -> bool:
+    """Whether a setting says module:function. A path of Windows has a colon too, behind the letter of its drive."""
+    return isinstance(value, str) and ":" in value and not PureWindowsPath(value).root
 
 
 def typed(section: str, node: Any) -> None:

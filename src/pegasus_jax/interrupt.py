@@ -13,8 +13,9 @@ from importlib.machinery import ExtensionFileLoader
 from types import FrameType
 from typing import Any
 
-# Windows has no SIGHUP.
-SIGNALS = tuple(signal.Signals[n] for n in ("SIGINT", "SIGTERM", "SIGHUP") if n in signal.Signals.__members__)
+# Windows has no SIGHUP; its SIGBREAK is Ctrl-Break, and a closed console.
+NAMES = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
+SIGNALS = tuple(signal.Signals[name] for name in NAMES if name in signal.Signals.__members__)
 
 WAITED = "compiling"  # the name of threads that the end of a success waits for: the compiler cannot be stopped
 PAUSE = 0.02  # seconds until a signal whose exception was lost, or could not be raised, is raised again

@@ -54,8 +54,15 @@ static inline int {name}_act(const {type} *x, {type} *u) {{
 
 CHECK = """\
 #include <stdio.h>
+#ifdef _WIN32
+#include <fcntl.h>
+#include <io.h>
+#endif
 #include "{name}.h"
 int main(void) {{
+#ifdef _WIN32
+    _setmode(_fileno(stdin), _O_BINARY); _setmode(_fileno(stdout), _O_BINARY);
+#endif
     {type} x[{observations}], u[{controls}];
     for (int i = 0; fread(x, sizeof *x, {observations}, stdin) == {observations}; ++i) {{
         if (i % {episode} == 0) {name}_reset();
@@ -244,7 +251,7 @@ def compiler() -> list[str]:
 
 def run(path: Path, observations: np.ndarray, episode: int = 20) -> np.ndarray:
     """What the header at `path` does for observations [N, O], of so many an episode, compiled here: controls [N, U]."""
-    name, text = path.stem, path.read_text()
+    name, text = path.stem, path.read_text(encoding="utf-8")
     controls = int(re.search(rf"define {name.upper()}_CONTROLS (\d+)", text)[1])  # type: ignore[index]
     check = CHECK.format(
         name=name,
@@ -255,7 +262,7 @@ def run(path: Path, observations: np.ndarray, episode: int = 20) -> np.ndarray:
     )
     with tempfile.TemporaryDirectory() as folder:
         program = Path(folder) / "check"
-        program.with_suffix(".c").write_text(check)
+        program.with_suffix(".c").write_text(check, encoding="utf-8")
         command = [*compiler(), "-std=c99", "-O2", "-I", str(path.parent), f"{program}.c", "-o", str(program), "-lm"]
         for words, given in ((command, None), ([str(program)], observations.tobytes())):
             done = subprocess.run(words, input=given, capture_output=True, check=False)

@@ -7,7 +7,8 @@ from pathlib import Path
 def folder() -> str | None:
     """Where a user's compiled programs are kept; None for a user without a home."""
     try:
-        return str(Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "pegasus_jax")
+        said = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA")  # the latter of Windows
+        return str(Path(said or Path.home() / ".cache") / "pegasus_jax")
     except RuntimeError:
         return None
 
@@ -20,7 +21,11 @@ def problem(path: Path) -> str | None:
         about = path.stat()
     except OSError as error:
         return f"cannot be used for compiled programs: {error.strerror}"
-    if about.st_uid != os.getuid():
+    try:
+        user = os.getuid()
+    except AttributeError:  # Windows: the folder of a user is closed to others by its access list, and has no mode
+        return None
+    if about.st_uid != user:
         return "belongs to another user"
     if about.st_mode & 0o022:
         return f"can be written by others (chmod 700 {path} closes it)"

@@ -49,7 +49,7 @@ def cpu() -> dict[str, str]:
     """What the system says of its first CPU, at least its "model name"; on Linux also what it can execute."""
     known = {"model name": f"{platform.machine()} {platform.processor()}"}
     try:
-        lines = Path("/proc/cpuinfo").read_text().split("\n\n")[0].splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").split("\n\n")[0].splitlines()
     except OSError:
         return known
     return known | {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}

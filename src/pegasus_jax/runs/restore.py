@@ -19,7 +19,7 @@ import numpy as np
 
 from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import compose, set_precision
-from pegasus_jax.checks import ConfigError, RunError
+from pegasus_jax.checks import ConfigError, RunError, names_code
 from pegasus_jax.config import Config
 from pegasus_jax.episode import verdict
 from pegasus_jax.experiment import Experiment
@@ -201,8 +201,8 @@ def announce(run: Path, config: Config) -> None:
     """Say which modules of their user a config names, and where they are. Raises RunError for one inside the run."""
     inside = run.resolve()
     own = (config.cost, config.stop, config.goals, config.constraint, config.explore.policy)
-    names = (*own, *(name for name in (config.env, config.reference, config.prior) if ":" in str(name)))
-    modules = sorted({name.partition(":")[0] for name in names if isinstance(name, str) and ":" in name})
+    names = (*own, config.env, config.reference, config.prior)
+    modules = sorted({str(name).partition(":")[0] for name in names if names_code(name)})
     for entry in (os.getcwd(), *sys.path) if modules else ():
         if Path(entry or ".").resolve().is_relative_to(inside):
             raise RunError(f"{entry or os.getcwd()} lies in {run}, and nothing is imported from there; go elsewhere")

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax.checks import ConfigError, shown
+from pegasus_jax.checks import ConfigError, names_code, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.task import Task
@@ -25,7 +25,7 @@ def of_config(config: Config, task: Task) -> Callable[[Any], Any] | None:
 
 def is_folder(name: str | Callable[..., Any] | None) -> bool:
     """Whether explore.policy= names a run's folder: no function of a module."""
-    return isinstance(name, str) and ":" not in name
+    return isinstance(name, str) and not names_code(name)
 
 
 def check(config: Config, task: Task) -> None:
