@@ -138,7 +138,7 @@ def told(python: str) -> str:
 
 def learns(python: str, wheel: zipfile.ZipFile, folder: Path) -> None:
     """Install the wheel by pip alone into an empty environment, and learn there, far from the sources."""
-    alone = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    alone = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "XLA_FLAGS"))}
     bare = folder / "bare" / ("Scripts" if os.name == "nt" else "bin")
 
     def run(*command: object) -> str:
