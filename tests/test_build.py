@@ -139,8 +139,13 @@ def test_a_config_is_built_once():
 
 
 def test_the_data_set_has_room_for_the_whole_run():
-    state = jax.eval_shape(compose(tiny(trials=7), cart(horizon=5)).init, jax.random.key(0))
-    assert state.data.x.shape == (35, 2)
+    def rows(trials: int, **changes: object) -> int:
+        experiment = compose(dataclasses.replace(tiny(trials=trials), **changes), cart(horizon=5))
+        return jax.eval_shape(experiment.init, jax.random.key(0)).data.x.shape[0]
+
+    assert rows(7) == rows(200) == 1024  # one program for both
+    assert rows(300) == 2048
+    assert rows(7, model=config.GP()) == 35  # where each row costs time
 
 
 def test_your_own_model_and_policy_take_the_place_of_the_configured_ones():

@@ -269,10 +269,11 @@ def test_the_whole_loop_learns_a_probe():
 
 
 def test_a_run_longer_than_its_data_set_is_refused():
-    """Capacity is that of config.trials; one more episode would overwrite the last one's rows, silently."""
+    """One more episode than there is room for would overwrite the last one's rows, silently."""
     exp = compose(tiny(**QUICK), cart(), dynamics=regression(2, 1), policy=noisy_linear_policy(cart()))
+    room = jax.eval_shape(exp.init, jax.random.key(0)).data.x.shape[0] // exp.task.horizon
     with pytest.raises(ValueError, match="trials"):
-        unchecked(jax.eval_shape)(run(exp, TRIALS + 1, 1), jax.random.key(0))
+        unchecked(jax.eval_shape)(run(exp, room + 1, 1), jax.random.key(0))
 
 
 @pytest.mark.parametrize(("offset", "kept"), [(0.0, True), (-100.0, False)])

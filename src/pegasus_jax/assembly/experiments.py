@@ -14,6 +14,7 @@ from pegasus_jax.assembly.searchers import limits, refines_successes, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.imagine import visited
+from pegasus_jax.learn.data import room
 from pegasus_jax.models.residual import on_differences, residual
 from pegasus_jax.policies.rate_limited import rate_limited
 from pegasus_jax.sharding import over_particles
@@ -87,8 +88,16 @@ def compose(
         refine_successes=searcher is None and refines_successes(config.search),
         begun=settings.begins_with_policy(config),
         compare=config.successor == "better",
-        capacity=config.trials * task.horizon + logged,
+        capacity=capacity(config, task, logged),
     )
+
+
+def capacity(config: settings.Config, task: Task, logged: int = 0) -> int:
+    """Rows that the data set of a config's run has room for: at least those of all trials, and `logged` ones."""
+    rows = config.trials * task.horizon + logged
+    # A fit of all rows, or a Gaussian process, takes longer for each row that it has room for: it has none too many.
+    every = isinstance(config.fit, settings.LBFGS) or isinstance(config.model, settings.GP | settings.SSGP)
+    return rows if every else room(rows)
 
 
 def explore_of(explore: settings.Explore, task: Task) -> Callable[[Key], Array]:

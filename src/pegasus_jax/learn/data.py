@@ -6,7 +6,14 @@ import jax.numpy as jnp
 from pegasus_jax.math.angles import difference
 from pegasus_jax.types import Array, Batch, Dataset, Key, Trajectory
 
-__all__ = ["add", "empty", "grow", "minibatch"]
+__all__ = ["add", "empty", "grow", "minibatch", "room"]
+
+LEAST_ROOM = 1024  # rows; 40 episodes of the cart-pole
+
+
+def room(rows: int) -> int:
+    """The capacity for at least so many rows: a power of two, so that runs of other lengths share compiled programs."""
+    return max(LEAST_ROOM, 1 << (rows - 1).bit_length())
 
 
 def empty(capacity: int, states: int, controls: int, memory: int = 0) -> Dataset:

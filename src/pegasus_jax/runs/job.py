@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from pegasus_jax import tasks
-from pegasus_jax.assembly.experiments import build, compose, set_precision
+from pegasus_jax.assembly.experiments import build, capacity, compose, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.learn.data import grow
@@ -78,7 +78,7 @@ def first_states(job: Job, stored: RunState | None = None, changed: bool = False
         states = restore.suited(stored, job.program("init", keys))
     else:
         states = stored
-    room = config.trials * job.experiment.task.horizon + job.logs.rows
-    if room > states.data.x.shape[1]:
-        states = states._replace(data=jax.vmap(partial(grow, capacity=room))(states.data))
+    rows = capacity(config, job.experiment.task, job.logs.rows)
+    if rows > states.data.x.shape[1]:
+        states = states._replace(data=jax.vmap(partial(grow, capacity=rows))(states.data))
     return states
