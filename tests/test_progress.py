@@ -32,7 +32,7 @@ ROW: dict[str, Any] = {
     "objective_last": 0.298,
     "calibration": 1.34,
     "skipped_updates": 0,
-    "seconds": {"fit": 15.0, "compile": 3.0},
+    "seconds": {"fit": 15.0, "compile": 3.0, "between_episodes": 18.04},
 }
 UNMEASURED = {"mean_cost": None, "success_rate": None}
 
@@ -41,7 +41,7 @@ def test_a_trial_in_one_line() -> None:
     assert summary([ROW], 15) == (
         "trial  7/15  17.5 s of plant  episode by the policy of trial 6: cost 0.375"
         "  policy now: cost 0.310, success 85%, imagined cost 0.298"
-        "  model errors 1.3 times as large as predicted  (18 s, 3 s of it compiling)"
+        "  model errors 1.3 times as large as predicted  (next episode after 18.0 s; compiling took 3.0 s)"
     )
 
 
@@ -51,7 +51,11 @@ def test_a_trial_in_one_line() -> None:
         (UNMEASURED, "episode by the policy of trial 6: cost 0.375  policy now: imagined cost 0.298", "success"),
         ({"policy": 4}, "by the policy of trial 4", "trial 6"),
         ({"policy": 0, "random": True}, "episode of random controls: cost 0.375", "by the policy"),
-        ({**UNMEASURED, "objective_last": None, "calibration": None}, "cost 0.375  (18 s", "policy now"),
+        (
+            {**UNMEASURED, "objective_last": None, "calibration": None},
+            "cost 0.375  (next episode after 18.0 s",
+            "policy now",
+        ),
         ({"replaced": False}, "policy kept: cost 0.310", "policy now"),
         ({"skipped_updates": 3}, "3 updates skipped", "None"),
     ],

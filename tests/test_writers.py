@@ -1,6 +1,7 @@
 """One loop, several writers: what is learned does not depend on where it is written."""
 
 from collections.abc import Callable
+from threading import Event
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ from pegasus_jax.checks import RunError
 from pegasus_jax.episode import Episode
 from pegasus_jax.experiment import run
 from pegasus_jax.runs import checkpoint, store, writers
+from pegasus_jax.runs.beside import beside
 from pegasus_jax.runs.display import Display
 from pegasus_jax.runs.job import Job, first_states
 from pegasus_jax.runs.programs import Program
@@ -109,9 +111,11 @@ def recorder(calls: list[tuple], episode: Callable[..., None] | None = None) -> 
 def test_a_writer_has_the_episode_before_anything_is_learned_from_it(job: Job) -> None:
     calls: list[tuple] = []
     learned(job, recorder(calls))
-    first = [("episode", 1, 0, 0), ("episode", 1, 1, 0), ("imagined", 1), ("trial", 1)]
-    assert calls[:5] == [("begin", 0), *first]
-    assert [call[:2] for call in calls[5:]] == [("episode", 2), ("episode", 2), ("imagined", 2), ("trial", 2)]
+    assert calls[:4] == [("begin", 0), ("episode", 1, 0, 0), ("episode", 1, 1, 0), ("imagined", 1)]
+    # The second episode does not wait for what is written of the first trial.
+    rest = [call[:2] for call in calls[4:]]
+    assert [call for call in rest if call != ("trial", 1)] == [("episode", 2)] * 2 + [("imagined", 2), ("trial", 2)]
+    assert ("trial", 1) in rest[:-1]
 
     def full() -> None:
         raise OSError("no space left")
@@ -146,3 +150,33 @@ def test_a_run_ends_where_nothing_can_be_learned_and_a_study_has_null(job: Job) 
     learned(job, study)
     assert [len(curve) for curve in handed[-1]["objective_last"]] == [TRIALS, TRIALS]
     assert handed[-1]["objective_last"][0] == [None] * TRIALS
+
+
+def test_what_is_done_beside_is_not_waited_for_and_its_error_is_heard() -> None:
+    """An episode begins before the row of the trial before is written; the block ends after that, or with its error."""
+    go, order = Event(), []
+
+    def slow() -> None:
+        go.wait(10)
+        order.append("written")
+
+    with beside() as hand:
+        hand(slow)
+        order.append("next episode")
+        hand.check()
+        go.set()
+    assert order == ["next episode", "written"]
+
+    def full() -> None:
+        raise OSError("no space left")
+
+    def both(first: Callable[[], None], second: Callable[[], None]) -> None:
+        with beside() as hand:
+            hand(first)
+            second()
+
+    with pytest.raises(OSError, match="no space"):
+        both(full, lambda: None)
+    with pytest.raises(OSError, match="no space"):  # an error elsewhere: what was learned is kept first
+        both(lambda: order.append("kept"), full)
+    assert order[2:] == ["kept"]

@@ -239,9 +239,15 @@ def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
         f"model errors {np.median(errors):.1f} times as large as predicted" if errors else "",
         skipped(rows),
         limits(rows),
-        f"({sum(first['seconds'].values()):.0f} s, {first['seconds']['compile']:.0f} s of it compiling)",
+        f"(next episode after {waited(first['seconds'])})",
     ]
     return "  ".join(part for part in parts if part)
+
+
+def waited(seconds: dict[str, float]) -> str:
+    """How long a robot waited for its next episode, and a trial for the compiler."""
+    compiling = f"; compiling took {seconds['compile']:.1f} s" if seconds["compile"] >= 0.05 else ""
+    return f"{seconds['between_episodes']:.1f} s{compiling}"
 
 
 def executed(rows: Sequence[dict[str, Any]]) -> str:

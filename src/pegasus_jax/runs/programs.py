@@ -5,9 +5,10 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
+from copy import copy
 from functools import cache, partial
 from importlib.metadata import entry_points
-from threading import Thread
+from threading import Lock, Thread
 from typing import Any
 
 import jax
@@ -53,14 +54,16 @@ class Jitted:
     def __init__(self, function: Callable[..., Any], **options: Any) -> None:
         self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
         self.coming: Future | None = None
+        self.one = Lock()  # compiles at a time
 
     def ready(self, *arguments: Any) -> None:
         """Wait until it is compiled for arguments of these shapes."""
-        if self.compiled is None:
-            began = time.monotonic()
-            # Traced here, where JAX has its caller's settings, and compiled elsewhere.
-            self.compiled = (self.coming or begun(self.function.lower(*arguments).compile)).result()
-            self.seconds = time.monotonic() - began
+        with self.one:
+            if self.compiled is None:
+                began = time.monotonic()
+                # Traced here, where JAX has its caller's settings, and compiled elsewhere.
+                self.compiled = (self.coming or begun(self.function.lower(*arguments).compile)).result()
+                self.seconds = time.monotonic() - began
 
     def __call__(self, *arguments: Any) -> Any:
         self.ready(*arguments)
@@ -87,6 +90,8 @@ class Program:
         side_by_side: bool | None = None,
     ) -> None:
         self.mesh, self.seeds = over, seeds
+        # Whether two parts may run at once. Sums across devices, and what processes tell each other, need one order.
+        self.concurrent = jax.process_count() == 1 and (over is None or over.shape[sharding.PARTICLES] == 1)
         self.drive, self.horizon = experiment.drive, experiment.task.horizon
         # Evaluation episodes. A GPU takes as long for one as for twenty; a CPU does not, and would have one more
         # program to compile.
@@ -116,6 +121,12 @@ class Program:
         self.spent: dict[str, float] = {}
         # Told of a part while its caller waits for the compiler; whoever shows progress puts its own here.
         self.on_compile: Callable[[str], AbstractContextManager[Any]] = nullcontext
+
+    def aside(self) -> "Program":
+        """The same compiled parts with a clock of their own, for another thread."""
+        same = copy(self)
+        same.spent, same.on_compile = {}, nullcontext
+        return same
 
     def prepare(self, part: str, *others: Any) -> None:
         """Begin to compile a part of states and `others`, or of states and a whole number, while others are at work."""

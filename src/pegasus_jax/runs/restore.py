@@ -127,7 +127,8 @@ def together(runs: Sequence[Path], experiment: Experiment, say: Callable[[str], 
     shared = set.intersection(*(set(checkpoint.available(run)) for run in runs))
     for run in runs:
         rows, problem = store.readable_trials(run)
-        proven = max([0, *checkpoint.available(run), *(n - 1 for n in store.numbered(run / "episodes", ".npz"))])
+        # An episode is run before all that the trial before it leaves has been written.
+        proven = max([0, *checkpoint.available(run), *(n - 2 for n in store.numbered(run / "episodes", ".npz"))])
         if len(rows) < proven:
             missing = problem or f"{run / 'trials.jsonl'} has {len(rows)} rows"
             again = f"those after {len(rows)} are done again, from their episodes"

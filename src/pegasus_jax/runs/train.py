@@ -4,8 +4,10 @@ Whatever is learned goes to a `Writer` (writers.py): `train` keeps a folder per 
 (runs/study.py) one JSON of all seeds.
 """
 
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +25,18 @@ from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.logs.read import Logged
 from pegasus_jax.runs import begin, checkpoint, config_io, logged, restore, store, tracked, writers
+from pegasus_jax.runs.beside import beside
 from pegasus_jax.runs.collect import collected, stacked
 from pegasus_jax.runs.display import learned
 from pegasus_jax.runs.evaluation import UNMEASURED, evaluate, kept_to, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
-from pegasus_jax.runs.programs import gather, is_main_process
+from pegasus_jax.runs.programs import Program, gather, is_main_process
 from pegasus_jax.runs.stuck import stuck
 from pegasus_jax.runs.writers import Row, part
 from pegasus_jax.task import Task
 from pegasus_jax.types import RunState, Trajectory
+
+Result = Callable[[], list[Row]]  # how a trial went, a row a seed; it may take a while
 
 UNKNOWN: dict[str, Any] = {
     "fit_loss": None,
@@ -128,74 +133,112 @@ def learn(job: Job, states: RunState, done: int | None = None) -> RunState:
     if done is None and (first_search(job.config) == 0 or begins_with_policy(job.config)):
         job.writer.ready(states)
     before: list[Row] = []
-    for trial in range((done or 0) + 1, job.config.trials + 1):
-        states, rows = one_trial(job, states, trial)
+
+    def kept(trial: int, states: RunState, result: Result) -> None:
+        rows = result()
         job.writer.trial(trial, states, rows)
         job.display.trial(rows)
         for line in stuck(before, rows):
             job.display.line(line)
-        before = [] if "logs" in rows[0] else rows
+        before[:] = [] if "logs" in rows[0] else rows
+
+    with beside(job.program.concurrent) as hand:
+        for trial in range((done or 0) + 1, job.config.trials + 1):
+            hand.check()
+            states, result = one_trial(job, states, trial)
+            hand(partial(kept, trial, states, result))
+        job.display.phase(job.config.trials, "evaluate", 0.9)
     return states
 
 
-def of_logs(job: Job, states: RunState) -> tuple[RunState, list[Row]]:
-    """Trial 1 of a run that begins with logs: they become data, then all goes on as after an episode."""
-    config, task, program = job.config, job.experiment.task, job.program
-    job.display.phase(1, "read")
-    logs = job.logs.episodes()
-    states, found = logged.added(states, logs, job.experiment), [unknown(task)] * len(job.seeds)
-    if config.explore.trials < 2:
-        states, found = improved(job, states, 1)
-    evaluation = evaluated(job, states, 1)
-    own = {"trial": 1, "plant_seconds": 0.0, "random": False, "policy": 0, **logged.told(logs, task)}
-    controls = np.concatenate([one.trajectory.u for one in logs])
-    rest = {"saturated": float(saturated(controls, task)), "calibration": None, "seconds": program.seconds()}
-    return states, [{**own, **measured, **learned, **rest} for measured, learned in zip(evaluation, found, strict=True)]
-
-
-def evaluated(job: Job, states: RunState, trial: int) -> list[Row]:
-    """What the policies [S] are worth after a trial, by episodes that are not data."""
-    job.display.phase(trial, "evaluate", 0.9)
-    keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(gather(states.key))
-    return evaluate(keys, states.policy.params, job.experiment.task, job.program, job.config.eval_episodes)
-
-
-def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, list[Row]]:
-    """One round of Alg. 1 for every seed, then the evaluation; a row a seed says how it went."""
+def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, Result]:
+    """One round of Alg. 1 for every seed, and what is to be asked how it went: no episode waits for that."""
     if trial == 1 and job.logs.rows:
         return of_logs(job, states)
     config, task, program = job.config, job.experiment.task, job.program
     # Line 3: run the policy on the plant.
     episodes, policies = collected(job, states, trial)
-    trajectories = stacked(episodes, task)
-    # Before this episode teaches the model, and after another has. No first trial should wait for the compiler.
-    judged = trial > first_search(config)
-    calibration = gather(program("calibrate", states, trajectories)) if judged else np.full(len(episodes), np.nan)
+    ended, trajectories, before = time.monotonic(), stacked(episodes, task), states
     # Line 4: add the episode to the data.
     states, found = program("add_episode", states, trajectories), [unknown(task)] * len(episodes)
     # Lines 5 and 6: fit the model, search a policy; not where the next episode is random too, and needs no policy.
     if trial >= config.explore.trials:
         states, found = improved(job, states, trial, trajectories)
-    evaluation = evaluated(job, states, trial)
-    sizes, seconds = np.asarray(gather(states.data.size)), program.seconds()
-    return states, [
-        {
-            "trial": trial,
-            "plant_seconds": round((int(sizes[index]) - job.logs.rows) * task.dt, 6),
-            "random": job.random(trial),
-            "policy": int(policies[index]),
-            **episode.verdict(ran, task),
-            "steps": len(ran.trajectory.u),
-            "ended": ran.ended,
-            **evaluation[index],
-            **found[index],
-            **kept_to(ran, task),
-            "saturated": float(saturated(ran.trajectory.u, task)),
-            "calibration": known(calibration[index]),
-            "seconds": seconds,
-        }
-        for index, ran in enumerate(episodes)
-    ]
+    evaluation = evaluated(job, states, trial, ended)
+
+    def rows() -> list[Row]:
+        measured, seconds = evaluation()
+        # Before this episode taught the model, and after another had.
+        judged, aside = trial > first_search(config), program.aside()
+        calibration = gather(aside("calibrate", before, trajectories)) if judged else np.full(len(episodes), np.nan)
+        sizes = np.asarray(gather(states.data.size))
+        return [
+            {
+                "trial": trial,
+                "plant_seconds": round((int(sizes[index]) - job.logs.rows) * task.dt, 6),
+                "random": job.random(trial),
+                "policy": int(policies[index]),
+                **episode.verdict(ran, task),
+                "steps": len(ran.trajectory.u),
+                "ended": ran.ended,
+                **measured[index],
+                **found[index],
+                **kept_to(ran, task),
+                "saturated": float(saturated(ran.trajectory.u, task)),
+                "calibration": known(calibration[index]),
+                "seconds": seconds,
+            }
+            for index, ran in enumerate(episodes)
+        ]
+
+    return states, rows
+
+
+def of_logs(job: Job, states: RunState) -> tuple[RunState, Result]:
+    """Trial 1 of a run that begins with logs: they become data, then all goes on as after an episode."""
+    config, task = job.config, job.experiment.task
+    job.display.phase(1, "read")
+    logs, ended = job.logs.episodes(), time.monotonic()
+    states, found = logged.added(states, logs, job.experiment), [unknown(task)] * len(job.seeds)
+    if config.explore.trials < 2:
+        states, found = improved(job, states, 1)
+    evaluation = evaluated(job, states, 1, ended)
+
+    def rows() -> list[Row]:
+        measured, seconds = evaluation()
+        own = {"trial": 1, "plant_seconds": 0.0, "random": False, "policy": 0, **logged.told(logs, task)}
+        controls = np.concatenate([one.trajectory.u for one in logs])
+        rest = {"saturated": float(saturated(controls, task)), "calibration": None, "seconds": seconds}
+        return [{**own, **worth, **learned, **rest} for worth, learned in zip(measured, found, strict=True)]
+
+    return states, rows
+
+
+def evaluated(job: Job, states: RunState, trial: int, ended: float) -> Callable[[], tuple[list[Row], dict[str, float]]]:
+    """() -> (what the policies [S] are worth after a trial, by episodes that are not data; the trial's seconds).
+
+    It is to be called when the next episode may begin; `ended` is when the last one did. An environment is one object,
+    whose episodes do not overlap: there the next episode waits for the evaluation.
+    """
+    task, program, count = job.experiment.task, job.program, job.config.eval_episodes
+
+    def measured(program: Program) -> list[Row]:
+        keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(gather(states.key))
+        return evaluate(keys, states.policy.params, task, program, count)
+
+    now = None
+    if task.environment is not None and count:
+        job.display.phase(trial, "evaluate", 0.9)
+        now = measured(program)
+    spent = program.seconds()
+
+    def told() -> tuple[list[Row], dict[str, float]]:
+        waited, aside = round(time.monotonic() - ended, 3), program.aside()
+        found = measured(aside) if now is None else now
+        later = aside.seconds()["evaluate"]
+        return found, spent | {"evaluate": spent["evaluate"] + later, "between_episodes": waited}
+
+    return told
 
 
 def unknown(task: Task) -> dict[str, Any]:
