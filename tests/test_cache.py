@@ -1,12 +1,19 @@
-"""The folder of compiled programs: made for its user alone, and not used where others could write."""
+"""The folder of compiled and traced programs: made for its user alone, not used where others could write or it is
+damaged."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from pegasus_jax.cli import main
-from pegasus_jax.runs import cache
+from pegasus_jax.presets import preset
+from pegasus_jax.runs import cache, traced
+from pegasus_jax.types import Trajectory
 from test_train import call
 
 
@@ -56,3 +63,54 @@ def test_an_open_folder_is_named_and_the_command_goes_on(tmp_path: Path, monkeyp
     assert "can be written by others" in done.stderr.splitlines()[0]
     assert "nowhere is not a run" in done.stderr.splitlines()[1]
     assert not list((tmp_path / "pegasus_jax").iterdir())
+
+
+def test_a_traced_program_is_traced_once_and_a_damaged_one_again(tmp_path: Path) -> None:
+    """With the same results, named tuples and a key among its arguments."""
+    traces: list[int] = []
+
+    def double(key: jax.Array, ran: Trajectory) -> tuple[Trajectory, jax.Array]:
+        traces.append(1)
+        return jax.tree.map(lambda leaf: 2 * leaf, ran), jax.random.normal(key)
+
+    kept = traced.Store(tmp_path, "a job")
+    given = jax.random.key(0), Trajectory(jnp.ones((3, 2)), jnp.ones((2, 1)), jnp.ones(2))
+
+    def result() -> tuple[Trajectory, jax.Array]:
+        fresh = lambda *arguments: double(*arguments)  # noqa: E731  (JAX remembers what it traced of a function)
+        return kept.lower("double", fresh, {}, *given).compile()(*given)
+
+    first, again = result(), result()
+    assert len(traces) == 1
+    (file,) = tmp_path.iterdir()
+    file.write_bytes(file.read_bytes()[:-1] + b"?")
+    for ran, drawn in (again, result()):
+        assert isinstance(ran, Trajectory)
+        np.testing.assert_array_equal(ran.x, first[0].x)
+        np.testing.assert_array_equal(drawn, first[1])
+    assert len(traces) == 2
+    kept.lower("double", double, {}, given[0], given[1]._replace(cost=jnp.ones(3)))
+    assert len(traces) == 3  # another shape is another program
+
+
+def test_a_program_belongs_to_its_settings(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = preset("cartpole")
+
+    def job(**changes: object) -> str:
+        found = traced.store(replace(config, **changes), 1, alone=True)
+        assert found is not None
+        return found.job
+
+    own = job()
+    assert own == job(seed=3) == job(trials=2)
+    others = {job(successor="better"), job(horizon=20), job(env_args=("pole_mass=0.4",)), job(x64=True)}
+    others.add(job(search=replace(config.search, learning_rate=2e-3)))
+    monkeypatch.setattr(traced, "code", lambda: "another version")
+    assert len({own, *others, job()}) == 7
+
+
+def test_what_a_user_wrote_is_traced_each_time() -> None:
+    config = preset("cartpole")
+    assert traced.store(replace(config, cost="costs:cost"), 1, alone=True) is None
+    assert traced.store(replace(config, constraint="limits:far"), 1, alone=True) is None
+    assert traced.store(config, 2, alone=False) is None

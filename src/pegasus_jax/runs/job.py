@@ -15,7 +15,7 @@ from pegasus_jax.assembly.experiments import build, capacity, compose, set_preci
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.learn.data import grow
-from pegasus_jax.runs import first, restore, writers
+from pegasus_jax.runs import first, restore, traced, writers
 from pegasus_jax.runs.display import Display
 from pegasus_jax.runs.logged import NONE, Logs
 from pegasus_jax.runs.programs import Program, is_main_process
@@ -51,7 +51,8 @@ def opened(config: Config, seeds: Sequence[int], mesh: Mesh | None = None, logs:
     if logs.rows:
         experiment = compose(loaded, experiment.task, mesh=mesh, logged=logs.rows)
     try:
-        program = Program(experiment, config.search.steps, len(seeds), mesh)
+        kept = traced.store(config, len(seeds), alone=mesh is None)
+        program = Program(experiment, config.search.steps, len(seeds), mesh, traced=kept)
         display = Display(config.trials, quiet=not is_main_process())
         display.asks = experiment.task.environment is not None
         with display.running():

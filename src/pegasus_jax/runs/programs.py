@@ -21,6 +21,7 @@ from pegasus_jax import interrupt, sharding
 from pegasus_jax.episode import Episode, trimmed
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.runs.machine import cpus
+from pegasus_jax.runs.traced import Store
 from pegasus_jax.types import Params, Trajectory
 
 NAMES = ("collect", "fit", "search", "imagine", "evaluate", "compile")
@@ -44,15 +45,19 @@ FAST_RUN: dict[str, dict] = {
     "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512},
     "gpu": GRAPHS | CONCURRENT_KERNELS,
 }
-LONG = ("fit", "search")
+# What runs once a trial, or a run: compiled in half of the time, it takes three times as long, some milliseconds more.
+ONCE = FAST_COMPILE | {"cpu": FAST_COMPILE["cpu"] | {"xla_backend_optimization_level": 0}}
+LONG, SELDOM = ("fit", "search"), ("init", "add_episode", "succeed", "calibrate")
 SINGLE_THREAD_BELOW = 128  # particles that one thread of a CPU imagines as fast as two
 
 
 class Jitted:
     """A jitted function that says how long its caller waited for compiling; compiles once, or it is a defect."""
 
-    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+    def __init__(self, function: Callable[..., Any], lower: Callable[..., Any] | None = None, **options: Any) -> None:
         self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
+        self.lower = self.function.lower if lower is None else lower
+        self.low: Any = None  # lowered
         self.coming: Future | None = None
         self.one = Lock()  # compiles at a time
 
@@ -62,7 +67,7 @@ class Jitted:
             if self.compiled is None:
                 began = time.monotonic()
                 # Traced here, where JAX has its caller's settings, and compiled elsewhere.
-                self.compiled = (self.coming or begun(self.function.lower(*arguments).compile)).result()
+                self.compiled = (self.coming or begun(self.lowered(*arguments).compile)).result()
                 self.seconds = time.monotonic() - began
 
     def __call__(self, *arguments: Any) -> Any:
@@ -72,7 +77,17 @@ class Jitted:
 
     def compile(self, *arguments: Any) -> Any:
         """The function compiled for arguments of these shapes."""
-        return self.function.lower(*arguments).compile()
+        return self.lowered(*arguments).compile()
+
+    def lowered(self, *arguments: Any) -> Any:
+        """The function lowered for arguments of these shapes, once."""
+        if self.low is None:
+            self.low = self.lower(*arguments)
+        return self.low
+
+    def shapes(self, *arguments: Any) -> Any:
+        """The shapes of its result."""
+        return self.lowered(*arguments).out_info
 
 
 class Program:
@@ -88,6 +103,7 @@ class Program:
         seeds: int = 1,
         over: Mesh | None = None,
         side_by_side: bool | None = None,
+        traced: Store | None = None,
     ) -> None:
         self.mesh, self.seeds = over, seeds
         # Whether two parts may run at once. Sums across devices, and what processes tell each other, need one order.
@@ -110,14 +126,14 @@ class Program:
         }
         self.axes = {name: axes for name, (_, axes) in functions.items()}
         layout = {} if over is None else {"out_shardings": sharding.over_seeds(over)}
-        self.parts = {
-            name: Jitted(
-                over_seeds(function, axes, seeds=seeds, over=over),
-                compiler_options=compiler_options(FAST_RUN if name in LONG else FAST_COMPILE),
-                **layout,
-            )
-            for name, (function, axes) in functions.items()
-        }
+
+        def part(name: str, function: Callable[..., Any], axes: tuple[int | None, ...]) -> Jitted:
+            whole = over_seeds(function, axes, seeds=seeds, over=over)
+            options = compiler_options(FAST_RUN if name in LONG else ONCE if name in SELDOM else FAST_COMPILE)
+            lower = None if traced is None else partial(traced.lower, name, whole, options)
+            return Jitted(whole, lower, compiler_options=options, **layout)
+
+        self.parts = {name: part(name, *how) for name, how in functions.items()}
         self.spent: dict[str, float] = {}
         # Told of a part while its caller waits for the compiler; whoever shows progress puts its own here.
         self.on_compile: Callable[[str], AbstractContextManager[Any]] = nullcontext
@@ -134,7 +150,7 @@ class Program:
         if jitted.compiled or jitted.coming:
             return
         keys = jax.eval_shape(lambda: jax.random.split(jax.random.key(0), self.seeds))
-        states = self.parts["init"].function.eval_shape(keys)
+        states = self.parts["init"].shapes(keys)
         rest = others or tuple(jax.ShapeDtypeStruct((), jnp.int32) for _ in self.axes[part][1:])
         arguments: tuple[Any, ...] = (states, *rest)
         if self.mesh is not None:
