@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from jax import Array
 
-from pegasus_envs.physics import mjx
 from pegasus_envs.plant import FRAME, draw_start, filled
+from pegasus_envs.quiet import mjx
 
 _ENTRY = re.compile(r"(qpos|qvel)\.(\d+)")
 LONGEST = 10_000  # time steps of a control period

@@ -11,9 +11,7 @@ takes the same steps with equations of motion of its own (`flippers`).
 # (MuJoCo's bindings and MJX's data classes declare few of their names.)
 
 import copy
-import io
 from collections.abc import Callable, Iterable
-from contextlib import redirect_stdout
 from functools import cache, partial
 from operator import attrgetter
 from pathlib import Path
@@ -24,9 +22,6 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax import Array
-
-with redirect_stdout(io.StringIO()):  # on import MJX prints that warp, which we do not use, is not installed
-    from mujoco import mjx
 
 from pegasus_envs.inertia import solve
 
@@ -58,13 +53,24 @@ _Stage = tuple[Array, Array, Array, Array]
 
 
 class Physics(NamedTuple):
-    """A mechanism, on the device and on the host."""
+    """A mechanism. What MJX needs of it is made when a program is traced, which a second run does not do."""
 
-    device: Any
-    """mjx.Model"""
-    blank: Any
-    """mjx.Data that no evaluation changes: each works on its own copy"""
+    name: str
+    """of its file in `assets`"""
+    fields: dict[str, Any]
+    """of MuJoCo's model, where they are others than the file's; they may be traced"""
     host: mujoco.MjModel
+
+    @property
+    def device(self) -> Any:
+        """mjx.Model"""
+        model, _ = _on_device(self.name, bool(jax.config.jax_enable_x64))
+        return model.tree_replace({field: jnp.asarray(value, float) for field, value in self.fields.items()})
+
+    @property
+    def blank(self) -> Any:
+        """mjx.Data that no evaluation changes: each works on its own copy"""
+        return _on_device(self.name, bool(jax.config.jax_enable_x64))[1]
 
 
 @cache
@@ -77,6 +83,8 @@ def _compiled(name: str) -> mujoco.MjModel:
 
 @cache
 def _on_device(name: str, x64: bool) -> tuple[Any, Any]:
+    from pegasus_envs.quiet import mjx
+
     del x64  # part of the cache's key only: the arrays have that precision
     here = jax.local_devices()[0]  # MJX would choose the first of all, which may be another process's
     with jax.ensure_compile_time_eval():  # so that a plant may be built inside jit, and still be cached
@@ -89,16 +97,14 @@ def load(name: str, changes: Iterable[Change] = ()) -> Physics:
 
     The host's copy changes too, unless a value is traced: then it keeps the file's constants.
     """
-    device, blank = _on_device(name, bool(jax.config.jax_enable_x64))
     host = copy.copy(_compiled(name))
     fields = {}
     for field, index, value in changes:
         fields[field] = _put(fields.get(field, attrgetter(field)(_compiled(name))), index, value)
-    device = device.tree_replace({field: jnp.asarray(value, float) for field, value in fields.items()})
     if not any(isinstance(value, jax.Array) for value in fields.values()):
         for field, value in fields.items():
             _write(host, field, value)
-    return Physics(device, blank, host)
+    return Physics(name, fields, host)
 
 
 def _write(host: mujoco.MjModel, field: str, value: np.ndarray) -> None:
@@ -135,6 +141,8 @@ def _put(array: Any, index: Any, value: Any) -> Any:
 
 def acceleration(physics: Physics, qpos: Array, qvel: Array, control: Array) -> Array:
     """Generalised acceleration [nv] under actuator commands [nu]; of a mechanism without springs, in no fluid."""
+    from pegasus_envs.quiet import mjx
+
     model, host = physics.device, physics.host
     if host.jnt_stiffness.any() or host.opt.density > 0.0 or host.opt.viscosity > 0.0:
         raise ValueError("the only passive forces that are computed here are those of dampers")
