@@ -55,7 +55,8 @@ def study(config: Config, seeds: int, over: Mesh | None, report: Callable[[Row],
     with opened(config, range(seeds), over) as job:
 
         def trial(number: int, states: RunState, rows: list[Row]) -> None:
-            spent.append(rows[0]["seconds"])
+            parts = {name: value for name, value in rows[0]["seconds"].items() if name != "between_episodes"}
+            spent.append(parts)
             row["compile_s"] = sum(trial["compile"] for trial in spent)
             row["trial_s"] = [sum(trial.values()) - trial["compile"] for trial in spent]
             row["run_s"] = sum(row["trial_s"])
