@@ -45,9 +45,9 @@ def test_nothing_is_said_of_a_first_trial_or_of_several_seeds() -> None:
 def test_a_run_says_it_once_for_each_two_trials(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = iter([FIRST | {"trial": 1, "random": True}, *(FIRST | {"trial": trial} for trial in (2, 3, 4))])
     monkeypatch.setattr(train, "one_trial", lambda job, states, trial: (states, lambda: [next(rows)]))
-    monkeypatch.setattr(train, "summary", lambda rows, trials: f"trial {rows[0]['trial']}")
     said: list[str] = []
-    display = SimpleNamespace(line=said.append, phase=lambda *told: None)
+    shown = {"phase": lambda *told: None, "trial": lambda rows: said.append(f"trial {rows[0]['trial']}")}
+    display = SimpleNamespace(line=said.append, **shown)
     given = dict(writer=writers.nothing(1), config=Config(trials=4), display=display, logs=NONE)
     job = SimpleNamespace(program=SimpleNamespace(concurrent=True), **given)
     train.learn(cast(Any, job), cast(Any, None))

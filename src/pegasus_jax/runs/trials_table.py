@@ -41,7 +41,7 @@ def cells(rows: Rows, last: int) -> list[str]:
         _mean(rows, "success_rate", ".0%"),
         _mean(rows, "objective_last", ".3f"),
         f"{np.median(errors):.1f}x" if errors else "-",
-        f"{sum(seconds.values()):.0f}",
+        f"{seconds.get('between_episodes', sum(seconds.values())):.0f}",
     ]
 
 
