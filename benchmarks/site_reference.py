@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 # A page of the API reference: its title and the modules whose names it has; families of functions have one each.
 GROUPS = {
-    "A run": ("config", "runs.start", "logs.read", "runs.controller", "exports.write", "math.delays", "checks"),
+    "A run": ("config", "start", "logs.read", "runs.controller", "exports.write", "math.delays", "checks"),
     "An experiment": ("assembly.experiments", "assembly.pieces", "experiment", "episode", "task", "vectorized"),
     "Imagination": ("imagine.scenarios", "imagine.rollout", "imagine.objective"),
     "Fit and search": ("learn.fit", "learn.gradient", "learn.search", "learn.schedule"),

@@ -3,6 +3,7 @@
 import dataclasses
 import inspect
 import itertools
+import re
 import subprocess
 import sys
 import tempfile
@@ -136,7 +137,7 @@ def example(*names: str) -> Callable[[Callable[[], Any]], Callable[[], Any]]:
 def _() -> Any:
     state = jax.eval_shape(pg.build(CONFIG).init, key())
     assert isinstance(state, pg.RunState)
-    assert state.data.x.shape == (50, 4)
+    assert state.data.x.shape == (1024, 4)  # room for the 50 rows of its trials, and more
 
 
 @example("compose")
@@ -449,7 +450,7 @@ def test_a_private_type_in_a_signature_is_found() -> None:
 def test_names_are_complete_and_others_are_refused() -> None:
     assert pg.__all__ == sorted(set(pg.__all__))
     assert {*dir(pg)} == {*pg.__all__, "__version__"}
-    assert pg.__version__.count(".") == 2
+    assert re.match(r"\d+\.\d+\.\d+", pg.__version__)
     with pytest.raises(AttributeError, match="no attribute rolout"):
         pg.rolout  # noqa: B018
     with pytest.raises(AttributeError, match=r"pegasus_jax\.Searcher is now called PolicyOptimizer"):

@@ -24,7 +24,7 @@ from pegasus_jax.runs.store import RunError
 from pegasus_jax.viz.learning_curves import groups_picture
 
 ROOT = Path(__file__).resolve().parents[1]
-EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "simulator.md").read_text(), re.DOTALL)
+EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "robot.md").read_text(), re.DOTALL)
 ROBOT = next(block for block in EXAMPLES if "class Arm(" in block)
 # The documented arm, without its sleep, which writes down what is asked of it and breaks where it is told to.
 WATCHED = """

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 import pegasus_jax as pg
+from pegasus_jax import start
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.cli import train as cli_train
-from pegasus_jax.runs import checkpoint, config_io, programs, restore, start, store
+from pegasus_jax.runs import checkpoint, config_io, programs, restore, store
 
 TINY: dict[str, Any] = {
     "model.hidden": (4,),
