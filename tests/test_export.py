@@ -220,7 +220,7 @@ def test_without_a_compiler_or_a_package_it_says_so(
     monkeypatch.setenv("CC", "no-such-compiler")
     with pytest.raises(ConfigError, match="format=c needs a C compiler"):
         pegasus_jax.export(runs["mlp"], format="c", out=tmp_path / "act.h")
-    for package, format in (("onnx", "onnx"), ("onnxruntime", "onnx"), ("flatbuffers", "stablehlo")):
+    for package, format in (("onnx", "onnx"), ("onnxruntime", "onnx")):
         with monkeypatch.context() as patch:
             patch.setitem(sys.modules, package, None)
             with pytest.raises(ConfigError, match=rf"{package} is missing: pip install 'pegasus-jax\[export\]'"):

@@ -37,7 +37,7 @@ assert int(state.trial) == 1
 
 # Dataset
 data = state.data
-assert (data.x.shape, data.u.shape, int(data.size)) == ((50, D), (50, U), 25)  # room for two episodes
+assert (data.x.shape, data.u.shape, int(data.size)) == ((1024, D), (1024, U), 25)  # with room for more
 
 # data
 batch = jax.eval_shape(lambda key: pg.data.minibatch(key, data, rows=10), key)

@@ -21,7 +21,7 @@ by more than 1e-5 of the control range is not kept.
          onnx           a graph for onnxruntime and others, of a batch of observations (RUN/controller.onnx)
          stablehlo      a function for jax.export.deserialize, of any policy (RUN/controller.stablehlo)
 
-onnx and stablehlo need the extra `export`: pip install 'pegasus-jax[export]'.
+onnx needs the extra `export`: pip install 'pegasus-jax[export]'.
 
 examples
   pegasus-export runs/cartpole-seed0

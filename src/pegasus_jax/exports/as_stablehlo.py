@@ -6,7 +6,6 @@ import jax
 import numpy as np
 from jax import export as jax_export
 
-from pegasus_jax.exports.as_onnx import imported
 from pegasus_jax.exports.layers import forgetful
 from pegasus_jax.exports.learned import Learned, function
 from pegasus_jax.runs.restore import precision
@@ -15,8 +14,7 @@ PLATFORMS = ("cpu", "cuda")
 
 
 def write(learned: Learned, name: str) -> bytes:
-    """The function of one observation [O], its weights inside. Raises ConfigError without the package flatbuffers."""
-    imported("flatbuffers")
+    """The function of one observation [O], its weights inside."""
     forgetful(learned, "stablehlo")
     act = function(learned)
     act.__name__ = name

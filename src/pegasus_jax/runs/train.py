@@ -142,7 +142,8 @@ def learn(job: Job, states: RunState, done: int | None = None) -> RunState:
             job.display.line(line)
         before[:] = [] if "logs" in rows[0] else rows
 
-    with beside(job.program.concurrent) as hand:
+    # A robot is driven by this process: nothing may hold up its control periods.
+    with beside(job.program.concurrent and job.experiment.task.environment is None) as hand:
         for trial in range((done or 0) + 1, job.config.trials + 1):
             hand.check()
             states, result = one_trial(job, states, trial)
