@@ -171,7 +171,7 @@ def test_an_environment_that_is_one_object_is_refused():
         study(Config(task="gym"), [0])
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_the_command_runs_what_is_missing_once_and_draws(tmp_path):
     (tmp_path / "mine.toml").write_text(TINY)
     first = paper("mine.toml", "out=there", "variants=loose", cwd=tmp_path)

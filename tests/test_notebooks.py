@@ -1,7 +1,6 @@
 """The notebooks run from the first cell to the last, and are stored with what they show."""
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -36,14 +35,17 @@ def test_notebooks_are_short_and_are_stored_with_their_pictures() -> None:
         assert (FOLDER / f"{name}.ipynb").stat().st_size < 250_000
 
 
-@pytest.mark.slow
-def test_notebooks_run(tmp_path: Path) -> None:
+# One is run for every change; the others take as long again each.
+RUN = [
+    pytest.param("own_plant", marks=pytest.mark.slow),
+    *(pytest.param(name, marks=pytest.mark.campaign) for name in sorted(NAMES - {"own_plant"})),
+]
+
+
+@pytest.mark.parametrize("name", RUN)
+def test_a_notebook_runs(name: str, tmp_path: Path) -> None:
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
-    for name in sorted(NAMES):
-        stored = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
-        shown = pictures(stored.cells)
-        folder = tmp_path / name
-        folder.mkdir()
-        nbclient.NotebookClient(stored, timeout=300, resources={"metadata": {"path": str(folder)}}).execute()
-        assert pictures(stored.cells) == shown
-        shutil.rmtree(folder)
+    stored = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)
+    shown = pictures(stored.cells)
+    nbclient.NotebookClient(stored, timeout=300, resources={"metadata": {"path": str(tmp_path)}}).execute()
+    assert pictures(stored.cells) == shown

@@ -91,7 +91,7 @@ def test_a_plant_that_is_not_there_is_one_line() -> None:
         main(["plants=[Pendulum]"])
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_one_seed_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["fit.steps=5", "search.steps=5", "model.hidden=[8]", "policy.hidden=[8]", "trials=1"]
     main(["plants=[Pendulum-v1]", "seeds=[100]", "jobs=1", f"out={tmp_path / 'suite.json'}", *words])

@@ -116,8 +116,7 @@ def test_episodes_can_be_read_without_us(whole: Path) -> None:
     "moment",
     [
         "second imagined",
-        pytest.param("first episode", marks=pytest.mark.slow),
-        *(pytest.param(f"{n} episode", marks=pytest.mark.campaign) for n in ("second", "third")),
+        *(pytest.param(f"{n} episode", marks=pytest.mark.campaign) for n in ("first", "second", "third")),
     ],
 )
 def test_killed_and_resumed_is_bit_equal(whole: Path, tmp_path: Path, moment: str) -> None:
@@ -182,7 +181,7 @@ def test_all_checkpoints_damaged_starts_from_the_episodes(whole: Path, tmp_path:
     assert fingerprint(run) == fingerprint(whole)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_path: Path) -> None:
     """As those of an older version may be, whose model was another. Resuming begins with the data."""
     run = copy_until(whole, tmp_path / "run", 2)
