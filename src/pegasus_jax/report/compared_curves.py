@@ -11,8 +11,7 @@ from pegasus_jax.report.chart import Band, Level, Line, Mark, chart, unit
 from pegasus_jax.report.page import number
 from pegasus_jax.report.tables import text
 from pegasus_jax.runs.groups import Group, Measured, middle, plant_seconds
-from pegasus_jax.runs.store import COLUMNS
-from pegasus_jax.runs.study import SOLVED
+from pegasus_jax.runs.store import COLUMNS, SOLVED
 
 COLORS = 8  # of the style sheet
 RAW = ("trial", *COLUMNS, "episode_success", "calibration", "saturated")  # of every run

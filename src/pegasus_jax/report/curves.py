@@ -11,6 +11,7 @@ from pegasus_jax.report.chart import Level, Line, chart, unit
 from pegasus_jax.report.page import number, table
 from pegasus_jax.report.read import Look
 from pegasus_jax.runs.display import executed
+from pegasus_jax.runs.store import SOLVED
 
 HEAD = (  # of the table of trials
     "trial",
@@ -51,7 +52,7 @@ def learning(found: Look) -> str:
         if evaluated
         else Line(seconds, own, "real", "the trial's own episode: 1 succeeded, 0 did not", [f"{v}" for v in own])
     )
-    success = chart("Success", "plant time [s]", "success rate", [rate, Level(0.9, "90 %")], y=(-0.04, 1.04))
+    success = chart("Success", "plant time [s]", "success rate", [rate, Level(SOLVED, "90 %")], y=(-0.04, 1.04))
     return f"<p>Every trial raw: nothing is smoothed. A lower cost is better.</p>{cost}{success}"
 
 

@@ -17,7 +17,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
 from pegasus_jax.config import Config, label
-from pegasus_jax.runs.trials_table import BLOCKS, PLAIN, best, curves, solved, table
+from pegasus_jax.runs.trials_table import BLOCKS, PLAIN, best, count_solved, curves, solved, table
 
 # A phase, and what it is called. A trial that begins with `read` finds its episode on disk, for example after a kill.
 PHASES = {
@@ -228,14 +228,13 @@ def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
     """A trial in one line, from the row of each seed; of several seeds the means, and the median of the errors."""
     first, several = rows[0], len(rows) > 1
     measured = first["mean_cost"] is not None
-    solved = sum(row["success_rate"] >= 0.9 for row in rows) if measured else 0
     errors = [row["calibration"] for row in rows if row["calibration"] is not None]
     parts = [
         f"trial {first['trial']:>2}/{trials}",
         f"{first['plant_seconds']:.1f} s of plant",
         f"{executed(rows)}: cost {_mean(rows, 'episode_cost'):.3f}",
         learned(rows),
-        f"{solved} of {len(rows)} seeds solved" if measured and several else "",
+        f"{count_solved(rows)} of {len(rows)} seeds solved" if measured and several else "",
         f"model errors {np.median(errors):.1f} times as large as predicted" if errors else "",
         skipped(rows),
         limits(rows),

@@ -52,6 +52,7 @@ UNFINISHED = re.compile(
 )
 EPISODE = ("x", "u", "cost", "task", "trial", "policy", "ended", "horizon")  # what every episode's file has
 ENDED = ("horizon", "terminated", "truncated", "error", "interrupted")  # how an episode can end
+SOLVED = 0.9  # of a trial's evaluation episodes succeed
 # What a row of trials.jsonl says in numbers, and readers of it use.
 COLUMNS = ("plant_seconds", "episode_cost", "mean_cost", "success_rate", "objective_last", "objective_fresh")
 

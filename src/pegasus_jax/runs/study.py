@@ -14,12 +14,11 @@ from pegasus_jax.config import Config
 from pegasus_jax.runs import begin, config_io, logged, writers
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.job import first_states, opened
+from pegasus_jax.runs.store import SOLVED
 from pegasus_jax.runs.train import learn
 from pegasus_jax.runs.writers import Row, Writer
 from pegasus_jax.task import Task
 from pegasus_jax.types import RunState
-
-SOLVED = 0.9  # of a trial's evaluation episodes succeed
 
 # The curves [S, T] of a study that are rounded, by the names that they have in a row of trials.jsonl too.
 ROUNDED = ("mean_cost", "episode_cost", "objective_last", "objective_fresh", "saturated", "calibration")
