@@ -106,15 +106,18 @@ def drive(seed: int, act: Callable[[int, np.ndarray], Any], task: Task) -> Episo
 
 
 def padded(trajectory: Trajectory, horizon: int) -> Trajectory:
-    """The episode of L <= H control periods in arrays of H, with its length: nothing recompiles for another L."""
-    length = len(trajectory.cost)
+    """The episode of L <= H control periods in arrays of H, with its length: nothing recompiles for another L.
 
-    def pad(rows: Any, size: int) -> Array:
-        rows = jnp.asarray(rows)
-        return jnp.pad(rows, [(0, size - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
+    In NumPy: a program for each L would be compiled between two episodes.
+    """
+    length: Any = np.int32(len(trajectory.cost))
+
+    def pad(rows: Any, size: int) -> Any:
+        rows = np.asarray(rows)
+        return np.pad(rows, [(0, size - len(rows)), *[(0, 0)] * (rows.ndim - 1)])
 
     x, u, cost = pad(trajectory.x, horizon + 1), pad(trajectory.u, horizon), pad(trajectory.cost, horizon)
-    return Trajectory(x, u, cost, jnp.int32(length), trajectory.memory)
+    return Trajectory(x, u, cost, length, trajectory.memory)
 
 
 def trimmed(trajectory: Trajectory) -> Trajectory:

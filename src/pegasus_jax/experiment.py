@@ -1,7 +1,6 @@
 """The loop of Alg. 1 as three seams: collect (the plant), add_episode (the data), improve (the mind)."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,6 +17,7 @@ from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.models.calibration import calibration
+from pegasus_jax.policies.driven import driver
 from pegasus_jax.policies.rate_limited import before, explored
 from pegasus_jax.shapes import check_shape
 from pegasus_jax.task import Task
@@ -117,7 +117,7 @@ def experiment(
     after an episode that succeeded is called with only_refines=True.
     """
     states, controls, memory = len(task.state_names), len(task.control_names), task.memory
-    see, given, advance = recall.steps(memory)
+    see, given, _ = recall.steps(memory)
     inputs, more = recall.given_size(memory, controls), 0 if task.hindsight is None else task.hindsight.more
 
     def init(key: Key) -> RunState:
@@ -147,46 +147,6 @@ def experiment(
 
         return episode.run(run_key, control, task)
 
-    def reaction(params: Params, noise: Params, m: Any, x: Array) -> tuple[Array, Any]:
-        u = policy.apply(params, noise, see(m, x))
-        return u, advance(m, x, u)
-
-    # What an episode on an environment asks of JAX, each compiled once.
-    plan_of, noise_of, begin = (
-        jax.jit(explore),
-        jax.jit(lambda key: jax.vmap(policy.sample)(jax.random.split(key, task.horizon))),
-        jax.jit(partial(recall.begin, memory)),
-    )
-    react = jax.jit(reaction)
-    costs_of = jax.jit(lambda whole: jax.vmap(task.cost.of_state)(episode.states(task, whole)[1:]))
-
-    def drive(key: Key, policy_params: Params, exploring: bool) -> Episode:
-        """An episode on the environment, with the costs of its rows."""
-        plan_key, seed_key, noise_key = jax.random.split(key, 3)
-        seed = int(jax.random.randint(seed_key, (), 0, 2**31 - 1))
-        plan = np.asarray(plan_of(plan_key))
-        noise = jax.tree.map(np.asarray, noise_of(noise_key))
-        # Compiled before the robot moves: the first control is to be as quick as the others.
-        resting = np.zeros(states, np.float32)
-        react(policy_params, jax.tree.map(lambda z: z[0], noise), begin(seed_key, resting), resting)
-        first = m = None
-        sent = recall.resting(task).astype(plan.dtype)
-
-        def control(t: int, x: np.ndarray) -> np.ndarray:
-            nonlocal first, m, sent
-            if t == 0:
-                first = m = begin(seed_key, x)
-            if exploring:
-                sent = explored(task, x, plan[t], sent, np)
-                return sent
-            u, m = react(policy_params, jax.tree.map(lambda z: z[t], noise), m, x)
-            return np.asarray(u)
-
-        found = episode.drive(seed, control, task)
-        ran = found.trajectory._replace(memory=first)
-        cost = np.asarray(costs_of(episode.padded(ran, task.horizon)))[: len(ran.u)]
-        return found._replace(trajectory=ran._replace(cost=cost))
-
     def driven(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
         if isinstance(key, Tracer):
             raise ValueError(f"task {task.name} has an environment, which nothing can trace: call this outside of jit")
@@ -200,6 +160,7 @@ def experiment(
         key = trial_key(state.key, state.trial + 1, COLLECT)
         return run_episode(key, state.policy.params, state.trial < explore_trials)
 
+    drive = driver(task, policy, explore)
     run_episode = one_episode if task.environment is None else driven
 
     def add_episode(state: RunState, trajectory: Trajectory) -> RunState:

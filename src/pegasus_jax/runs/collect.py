@@ -3,7 +3,6 @@
 from contextlib import nullcontext
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import episode, interrupt
@@ -27,7 +26,7 @@ def collected(job: Job, states: RunState, trial: int) -> tuple[list[Episode], np
     """
     task, known = job.experiment.task, job.writer.known(trial)
     missing = any(ran is None for ran in known)
-    learned = np.asarray(gather(states.policy_trial))
+    learned = gather(states.policy_trial)
     policies = np.zeros_like(learned) if job.random(trial) else learned
     last = job.config.trials  # the one more episode that a run may end with is shown as the end of its last trial
     job.display.phase(min(trial, last), "collect" if missing else "read", float(trial > last))
@@ -98,4 +97,4 @@ def failed(ran: Episode, task: Task, advice: str = "", kept: bool = True) -> Non
 def stacked(episodes: list[Episode], task: Task) -> Trajectory:
     """The episodes as one Trajectory [S, ...], each in arrays of H periods where the task may end early."""
     shaped = [episode.padded(ran.trajectory, task.horizon) if task.may_end else ran.trajectory for ran in episodes]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *shaped)
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *shaped)

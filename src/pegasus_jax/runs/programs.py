@@ -182,10 +182,10 @@ class Program:
     def collect(self, keys: Any, params: Params, exploring: bool, purpose: str = "collect") -> list[Episode]:
         """An episode of each seed's policy [S, ...], or of random controls."""
         if self.drive is None:
-            ran: Trajectory = gather(self("episode", keys, params, jnp.asarray(exploring), purpose=purpose))
+            ran: Trajectory = gather(self("episode", keys, params, np.asarray(exploring), purpose=purpose))
             alone = [trimmed(jax.tree.map(lambda leaf: leaf[i], ran)) for i in range(self.seeds)]  # noqa: B023
             return [Episode(one, "horizon" if len(one.u) == self.horizon else "terminated") for one in alone]
-        began = time.monotonic()
+        began, params = time.monotonic(), gather(params)
         found = [
             self.drive(keys[i], jax.tree.map(lambda leaf: leaf[i], params), exploring)  # noqa: B023
             for i in range(self.seeds)
@@ -195,11 +195,11 @@ class Program:
 
     def evaluate(self, keys: Any, params: Any) -> np.ndarray:
         """Costs [S, E, H] of episodes on a plant in JAX of the policies, one for each key [S, E]."""
-        follow = jnp.asarray(False)  # the policy, not random controls
+        follow = np.asarray(False)  # the policy, not random controls
         if self.side_by_side:
-            return np.asarray(gather(self("evaluate", keys, params, follow).cost))
+            return gather(self("evaluate", keys, params, follow).cost)
         several = (self("episode", some, params, follow, purpose="evaluate") for some in jnp.swapaxes(keys, 0, 1))
-        return np.stack([np.asarray(gather(episode.cost)) for episode in several], axis=1)
+        return np.stack([gather(episode.cost) for episode in several], axis=1)
 
     def seconds(self) -> dict[str, float]:
         """Seconds spent in each part since the last call."""
@@ -301,14 +301,16 @@ def shape_structs(tree: Any, layout: NamedSharding) -> Any:
 
 
 def gather(tree: Any) -> Any:
-    """The tree's arrays whole on this process, whatever devices of whatever process hold them."""
-    if jax.process_count() == 1:
-        return tree
+    """The tree's arrays whole on this process, whatever devices of whatever process hold them.
+
+    In NumPy, but for random keys: what a trial does with them is no program that would have to be compiled.
+    """
+    several = jax.process_count() > 1
 
     def get(leaf: Any) -> Any:
         if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key):
-            return jax.random.wrap_key_data(get(jax.random.key_data(leaf)))
-        return jnp.asarray(multihost_utils.process_allgather(leaf, tiled=True))
+            return jax.random.wrap_key_data(get(jax.random.key_data(leaf))) if several else leaf
+        return np.asarray(multihost_utils.process_allgather(leaf, tiled=True) if several else leaf)
 
     return jax.tree.map(get, tree)
 

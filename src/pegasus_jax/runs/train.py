@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
@@ -172,7 +171,7 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, Result]
         # Before this episode taught the model, and after another had.
         judged, aside = trial > first_search(config), program.aside()
         calibration = gather(aside("calibrate", before, trajectories)) if judged else np.full(len(episodes), np.nan)
-        sizes = np.asarray(gather(states.data.size))
+        sizes = gather(states.data.size)
         return [
             {
                 "trial": trial,
@@ -259,7 +258,7 @@ def improved(
     phase(trial, "fit", 0.02)
     incumbents, none = states.policy.params, np.zeros(len(job.seeds))
     fitted = FitInfo(*(none,) * len(FitInfo._fields))  # type: ignore[arg-type]
-    if np.asarray(gather(states.data.size)).any():
+    if gather(states.data.size).any():
         states, fitted = program("fit", states)
         fitted = gather(fitted)
     if not np.isfinite(fitted.loss).any():
@@ -269,8 +268,8 @@ def improved(
     for i in range(program.chunks):
         cost = np.mean(last(found)) if found else None
         phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)
-        states, searched = program("search", states, jnp.int32(i * program.chunk))
-        found.append(jax.tree.map(np.asarray, gather(searched)))
+        states, searched = program("search", states, np.int32(i * program.chunk))
+        found.append(gather(searched))
         program.prepare("succeed", incumbents)  # once; not before the first of the search, for which everybody waits
         if trajectories is not None:
             program.prepare("calibrate", trajectories)
@@ -288,7 +287,7 @@ def improved(
             "fit_loss": float(fitted.loss[index]),
             "objective_first": float(objective[index, 0]),
             "objective_last": float(reached[index]),
-            "objective_fresh": float(jnp.mean(successor.cost[index])),
+            "objective_fresh": float(np.mean(successor.cost[index])),
             "objective_incumbent": known(successor.incumbent[index]),
             "replaced": bool(successor.replaced[index]),
             "gradient_norm": float(np.median(norm[index, : done[index]])),
