@@ -181,3 +181,24 @@ def test_where_episodes_end_is_looked_at_before_they_begin(stop: Any, says: str 
     task, config = cart()._replace(stop=stop), Config(task="gym", stop="robot:fallen")
     with pytest.raises(ConfigError, match=says) if says else nullcontext():
         check.stopping(config, task)
+
+
+@pytest.mark.parametrize(
+    ("names", "angles", "told"),
+    [
+        (("heading [rad]", "rate [rad/s]"), (0,), []),
+        (
+            ("heading [rad]", "rate [rad/s]"),
+            (),
+            ["heading [rad] is not among angles=; if it can turn around, angles=[0]"],
+        ),
+        (("y [m]", "x1"), (0,), ["angles=[0]: y [m] is said to be an angle, and its unit is not rad"]),
+        (("x0", "x1"), (0,), []),
+    ],
+)
+def test_names_that_do_not_agree_with_angles_are_noted(
+    names: tuple[str, ...], angles: tuple[int, ...], told: list[str]
+) -> None:
+    free = np.full(2, np.inf)
+    facts = Facts(np.zeros(2), np.ones(2), angles, -free, free, np.zeros((0, 2)))
+    assert check.turning(facts, names) == told

@@ -65,10 +65,10 @@ REFUSED = {
     "dic": "returns a dict; expected one number",
     "text": "returns a str; expected one number",
     "compl": "returns a complex number",
-    "out_of_range": "reads entry 7 of 2 at costs.py:24, where JAX takes another; x has 2, 0 to 1",
-    "below": "reads entry -3 of 2 at costs.py:25",
-    "listed": "reads entry 2 of 2 at costs.py:26",
-    "jitted": "reads entry 2 of 2 at costs.py:28",
+    "out_of_range": "reads entry 7 of an array of 2 at costs.py:24; x has 2, 0 to 1, and rates behind them",
+    "below": "reads entry -3 of an array of 2 at costs.py:25",
+    "listed": "reads entry 2 of an array of 2 at costs.py:26",
+    "jitted": "reads entry 2 of an array of 2 at costs.py:28",
     "divides": ": TypeError: object of type 'int' has no len() (costs.py:29)",
     "index": "is not a JAX function",
     "loop": "Reverse-mode differentiation does not work",
@@ -116,14 +116,12 @@ FINE = {
     "a unit vector": (lambda x: (1 - x[0] / jnp.linalg.norm(x[:2])) / 2, facts((-1, 0, 0), (0.5,) * 3, ())),
     "a cosine": (lambda x: (1 - x[0]) / 2, facts((-1, 0), (0.1, 0.1), (), limit=1.0)),
     "an arc cosine": (lambda x: jnp.arccos(0.999 * x[0]) / jnp.pi, facts((-1, 0), (0.1, 0.1), (), limit=1.0)),
-    "narrow": (lambda x: 1 - jnp.exp(-0.5 * (x @ x) / 0.01**2), facts((3, 0), (0.1, 0.1), ())),
     "micrometres": (lambda x: 1 - jnp.exp(-((x[0] * 1e6) ** 2)), facts((2e-6, 0), (1e-7, 1.0), ())),
     "a table": (interpolated, facts()),
     "clipped on purpose": (lambda x: 1 - jnp.exp(-(jnp.take(x, 9, mode="clip") ** 2)), facts()),
     "a part": (lambda x: 1 - jnp.exp(-(x[-1] ** 2) - jnp.sum(x[1:5]) ** 2), facts()),
     "compiled": (jax.jit(lambda x: jnp.tanh(x @ x)), facts()),
     "an absolute value": (lambda x: jnp.minimum(jnp.abs(x[0]) / 4, 1.0), facts()),
-    "no angle, far away": (lambda x: 1 - jnp.exp(-((x[0] - 100) ** 2) / 200), facts((0, 0), (0.1, 0.1), ())),
 }
 
 
@@ -137,6 +135,13 @@ def test_a_cost_above_one_is_only_noted():
     (note,) = cost_check.notes(lambda x: 10 * (1 - jnp.cos(x[0])), facts(), "cost=x:y")
     assert note.startswith("cost=x:y is ")
     assert "success=0.2" in note
+
+
+@pytest.mark.parametrize(("width", "flat"), [(10.0, True), (100.0, False)])
+def test_a_cost_that_is_flat_where_episodes_start_is_noted(width, flat):
+    far = facts((0, 0), (0.1, 0.1), ())
+    found = cost_check.notes(lambda x: 1 - jnp.exp(-(((x[0] - 100) / width) ** 2) / 2), far, "cost=x:y")
+    assert ["is 1 where episodes start and changes by" in note for note in found] == [True] * flat
 
 
 def test_probes_are_the_start_zero_and_all_around_the_circle_within_the_limits():

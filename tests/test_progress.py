@@ -29,7 +29,11 @@ ROW: dict[str, Any] = {
     "episode_cost": 0.375,
     "mean_cost": 0.31,
     "success_rate": 0.85,
-    "objective_last": 0.298,
+    "episode_success": False,
+    "ended": "horizon",
+    "steps": 25,
+    "objective_last": 0.25,
+    "objective_fresh": 0.298,
     "calibration": 1.34,
     "skipped_updates": 0,
     "seconds": {"fit": 15.0, "compile": 3.0, "between_episodes": 18.04},
@@ -39,21 +43,23 @@ UNMEASURED = {"mean_cost": None, "success_rate": None}
 
 def test_a_trial_in_one_line() -> None:
     assert summary([ROW], 15) == (
-        "trial  7/15  17.5 s of plant  episode by the policy of trial 6: cost 0.375"
+        "trial  7/15  17.5 s of plant  episode by the policy of trial 6: cost 0.375, no success"
         "  policy now: cost 0.310, success 85%, imagined cost 0.298"
-        "  model errors 1.3 times as large as predicted  (next episode after 18.0 s; compiling took 3.0 s)"
+        "  model errors 1.3 times as large as predicted  (18.0 s until the next episode, 3.0 s of them compiling)"
     )
 
 
 @pytest.mark.parametrize(
     ("changes", "says", "does_not_say"),
     [
-        (UNMEASURED, "episode by the policy of trial 6: cost 0.375  policy now: imagined cost 0.298", "success"),
+        (UNMEASURED, "cost 0.375, no success  policy now: imagined cost 0.298", "success 85%"),
+        ({"episode_success": True}, "cost 0.375, success  policy now", "no success"),
+        ({"ended": "interrupted", "steps": 17}, "cost 0.375, interrupted after 17 periods, no success", "horizon"),
         ({"policy": 4}, "by the policy of trial 4", "trial 6"),
         ({"policy": 0, "random": True}, "episode of random controls: cost 0.375", "by the policy"),
         (
-            {**UNMEASURED, "objective_last": None, "calibration": None},
-            "cost 0.375  (next episode after 18.0 s",
+            {**UNMEASURED, "objective_fresh": None, "calibration": None},
+            "cost 0.375, no success  (18.0 s until the next episode",
             "policy now",
         ),
         ({"replaced": False}, "policy kept: cost 0.310", "policy now"),
@@ -72,7 +78,26 @@ def test_several_seeds_are_means_and_the_median_of_the_errors() -> None:
     assert "success 93%" in line
     assert "2 of 3 seeds solved" in line
     assert "errors 2.0 times" in line
-    assert "episodes: cost" in summary([ROW, ROW | {"policy": 5}], 15)
+    assert "episodes: cost 0.375, 1 of 2 succeeded" in summary([ROW, ROW | {"policy": 5, "episode_success": True}], 15)
+
+
+def test_a_trial_that_is_not_the_best_says_which_is() -> None:
+    text = io.StringIO()
+    display = Display(9, Console(file=text, width=400))
+    display.trial([ROW | {"trial": 1, "success_rate": 0.95}])
+    display.trial([ROW | {"trial": 2}])
+    assert ["best so far: trial 1" in line for line in text.getvalue().splitlines()] == [False, True]
+
+
+def test_a_trial_that_is_still_evaluated_has_its_line_before_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "BRIEF", 0.1)
+    text = io.StringIO()
+    with Display(3, Console(file=text, width=400)).running() as display:
+        display.phase(2, "fit")
+        time.sleep(0.4)
+        display.trial([ROW | {"trial": 1}])
+        time.sleep(0.4)
+    assert [line.split("  ")[0].strip() for line in text.getvalue().splitlines()] == ["trial", "trial 2/3"]
 
 
 def test_the_best_policy_is_named() -> None:
@@ -146,11 +171,12 @@ def test_a_log_has_a_line_a_phase_and_is_never_silent_for_long(monkeypatch: pyte
         display.phase(1, "fit")
         with display.compiling("fit"):
             time.sleep(0.4)
-        display.phase(1, "search", 0.2, 0.51)
+        display.phase(1, "search", 0.2, ", step 200 of 1000")
         time.sleep(1.1)
     lines = text.getvalue().splitlines()
     assert lines[0] == "compiling the fit (once)"
-    assert lines[1:] == ["trial 1/3  searching a policy  imagined cost 0.510"] * 2
+    assert lines[1] == "trial 1/3  searching a policy, step 200 of 1000"
+    assert lines[2] == f"{lines[1]}  1 s so far"
     before = text.getvalue()
     time.sleep(0.8)
     assert text.getvalue() == before
@@ -192,7 +218,7 @@ def test_a_terminal_has_a_table_of_the_trials() -> None:
     assert lines[0].split("  ")[0] == "trial"
     assert "plant [s]" in lines[0]
     assert [line.split()[0] for line in lines[1:4]] == ["1/4", "2/4", "3/4"]
-    assert lines[3].split()[2:6] == ["0.375", "0.250", "75%", "0.298"]
+    assert lines[3].split()[2:6] == ["0.375", "0.250", "75%", "0.300"]
     assert lines[4] == "cost ▇▅▃   success ▃▅▇"
     assert lines[5] == "best so far: trial 3 (success 75%, cost 0.250)"
     assert lines[6].startswith("trial 4/4  fitting the model")

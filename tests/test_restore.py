@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,6 +14,7 @@ from folders import a_run
 from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError, RunError
+from pegasus_jax.learn.data import grow
 from pegasus_jax.runs import checkpoint, config_io, restore, store
 from test_train import call
 
@@ -69,6 +71,16 @@ def test_another_optimizer_leaves_what_was_learned(run: Path) -> None:
     whole = restore.suited(state, jax.jit(experiment.init)(jax.random.key(0)))
     like = jax.eval_shape(experiment.init, jax.random.key(0))
     assert jax.tree.structure(whole) == jax.tree.structure(like)
+
+
+def test_a_checkpoint_may_have_more_room_than_a_shorter_run_needs(run: Path) -> None:
+    _, _, state = restore.restored(run, 2)
+    roomy = grow(state.data, 2 * len(state.data.x))
+    checkpoint.save(run, 2, state._replace(data=roomy))
+    assert checkpoint.fingerprint(restore.restored(run, 2)[2]) == checkpoint.fingerprint(state)
+    checkpoint.save(run, 2, state._replace(data=roomy._replace(size=jnp.int32(len(roomy.x)))))
+    with pytest.raises(RunError, match=r"data.x is"):
+        restore.restored(run, 2)
 
 
 def test_damaged_checkpoints_are_named(run: Path) -> None:

@@ -277,7 +277,7 @@ def test_a_cost_is_checked_with_all_that_it_takes():
         checked(lambda x, u: -(u[0] ** 2))
     with pytest.raises(ConfigError, match=r"has a gradient that is nan at x=\[.*2 before="):
         checked(lambda x, u, previous_u: jnp.linalg.norm(u - previous_u) + jnp.linalg.norm(x - x))
-    with pytest.raises(ConfigError, match=r"reads entry 1 of 1"):
+    with pytest.raises(ConfigError, match=r"reads entry 1 of an array of 1"):
         checked(lambda x, u: 1 - jnp.exp(-(u[1] ** 2)))
     with pytest.raises(ConfigError, match=r"more than 1|TypeError"):
         checked(lambda x, u: len(3))

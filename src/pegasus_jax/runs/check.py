@@ -1,5 +1,6 @@
 """pegasus-check: what a task is like, and what would go wrong, before anything moves; pegasus-train asks it first."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -52,6 +53,7 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     return [
         *rates,
         *notes,
+        *turning(facts, task.state_names),
         *plausible(readings, facts, task.state_names),
         *alike(readings, task.angles, task.state_names),
     ]
@@ -94,6 +96,19 @@ def stopping(config: Config, task: Task) -> None:
         raise ConfigError(f"{what} is {float(value):g} at the start; expected a probability in [0, 1], or a bool")
     if float(value) > 0.5:
         raise ConfigError(f"{what} is {float(value):g} at the start: every episode would end there")
+
+
+def turning(facts: cost_check.Facts, names: tuple[str, ...]) -> list[str]:
+    """Notes on entries whose unit is an angle's and that are not said to be angles, and the other way round."""
+    places = entries(len(facts.start_mean) + len(facts.circles), facts.circles)
+    notes = []
+    for entry, name in enumerate(names):
+        unit = re.search(r"\[(.*)\]$", name)
+        if unit and unit[1] == "rad" and entry not in facts.angles:
+            notes.append(f"{name} is not among angles=; if it can turn around, angles=[{places[entry]}]")
+        elif unit and unit[1] != "rad" and entry in facts.angles:
+            notes.append(f"angles=[{places[entry]}]: {name} is said to be an angle, and its unit is not rad")
+    return notes
 
 
 def plausible(readings: np.ndarray, facts: cost_check.Facts, names: tuple[str, ...]) -> list[str]:
@@ -163,6 +178,7 @@ def report(config: Config) -> list[str]:
         "task": " ".join([config.task, *([task.name] if task.name != config.task else [])]),
         **tasks.described(config),
         "observation": ", ".join(task.state_names),
+        "angles": ", ".join(task.state_names[i] for i in task.angles) or "none",
         "control": ", ".join(
             f"{name} from {low:g} to {high:g}"
             + ("" if np.isinf(change) else f", by at most {change / task.dt:g} a second")
@@ -170,7 +186,8 @@ def report(config: Config) -> list[str]:
                 task.control_names, task.control_low, task.control_high, largest_change(task), strict=True
             )
         ),
-        "time": f"{task.horizon} periods of {task.dt:g} s an episode, {task.horizon * task.dt:g} s",
+        "time": f"{task.horizon} periods of {task.dt:g} s an episode, {task.horizon * task.dt:g} s"
+        + ("" if asked.horizon else "; horizon= changes that"),
         "start": f"{_numbers(task.start_mean)}, give or take {_numbers(task.start_std)}",
         "cost there": f"{float(task.cost.of_state(start)):.4g}; below {task.success:g} is success",
     }

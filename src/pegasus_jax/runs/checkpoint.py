@@ -22,6 +22,8 @@ from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.store import numbered
 from pegasus_jax.types import Key, RunState
 
+ROWS = ("data.x", "data.u", "data.y", "data.memory")  # arrays with as many rows as there is room for
+
 
 def save(run: Path, trial: int, state: RunState) -> None:
     """Write the state after a trial; complete once its list of sums exists."""
@@ -62,8 +64,9 @@ def damage(run: Path, trial: int) -> str | None:
 def restore(run: Path, trial: int, like: RunState) -> RunState:
     """The state after a trial; `like` is a state of the same experiment (shapes are enough: eval_shape of init).
 
-    The data may have fewer rows than in `like`. An optimizer is None where it is that of other settings. Raises
-    RunError, naming the difference, when the rest is the state of another experiment or version.
+    The data may have room for fewer rows than in `like`, and for more that are not in use. An optimizer is None where
+    it is that of other settings. Raises RunError, naming the difference, when the rest is the state of another
+    experiment or version.
     """
     folder, like = _folder(run, trial), jax.eval_shape(_plain, like)
     with _checkpointer() as checkpointer:
@@ -73,6 +76,7 @@ def restore(run: Path, trial: int, like: RunState) -> RunState:
             raise RunError(f"{folder} is of another version: orbax cannot read it as ours") from error
     stored |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in _named(like).items() if not leaf.size}
     stored.setdefault("succeeded", np.zeros((), bool))  # older runs did not keep it
+    stored |= _shortened(stored, len(like.data.x))
     optimizers = {"model": like.model.optimizer, "policy": like.policy.optimizer}
     rest = like._replace(model=like.model._replace(optimizer=None), policy=like.policy._replace(optimizer=None))
     if difference := _difference(stored, _named(rest)):
@@ -134,14 +138,22 @@ def _named(tree: Any, prefix: str = "") -> dict[str, Any]:
     return {prefix + jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
+def _shortened(stored: dict[str, Any], room: int) -> dict[str, Any]:
+    """The rows of the data in a smaller room, if all that are in use have a place there; else nothing."""
+    used = stored.get("data.size")
+    if used is None or used.shape or used > room:
+        return {}
+    return {name: stored[name][:room] for name in ROWS if name in stored and stored[name].shape}
+
+
 def _difference(stored: dict[str, Any], expected: dict[str, Any]) -> str | None:
     """The first leaf that is missing, or has another shape or type than expected, in words."""
-    rows = {stored[name].shape[:1] for name in stored if name in ("data.x", "data.u", "data.y")}
+    rows = {stored[name].shape[:1] for name in stored if name in ROWS}
     for name, leaf in expected.items():
         if name not in stored:
             return f"it has no {name}"
         found, shape = stored[name], leaf.shape
-        if name in ("data.x", "data.u", "data.y") and len(rows) == 1 and (found.shape[:1] or (-1,)) <= shape[:1]:
+        if name in ROWS and len(rows) == 1 and (found.shape[:1] or (-1,)) <= shape[:1]:
             shape = (*found.shape[:1], *shape[1:])
         if (found.shape, found.dtype) != (shape, leaf.dtype):
             return f"{name} is {found.dtype} {list(found.shape)}, and these settings make it {leaf.dtype} {list(shape)}"

@@ -85,10 +85,9 @@ class Display:
             over.set()
             speaker.join(timeout=1.0)  # so that nothing follows what is said of the end
 
-    def phase(self, trial: int, what: str, fraction: float = 0.0, cost: Any = None) -> None:
-        """Trial `trial` is doing `what`; `fraction` of it is done, and `cost` [] is what was imagined last."""
+    def phase(self, trial: int, what: str, fraction: float = 0.0, note: str = "") -> None:
+        """Trial `trial` is doing `what`; `fraction` of it is done, and `note` says how that goes."""
         self.clock.phase(trial, what)
-        note = "" if cost is None else f"  imagined cost {float(cost):.3f}"
         words = f"trial {trial}/{self.trials}  {PHASES.get(what, what)}{note}"
         self._show(words, fraction, stage=f"{trial} {what}")
         if self.asks and self.console.is_terminal:
@@ -113,7 +112,8 @@ class Display:
         """A trial is done, with these rows, one a seed: a row of the table, or a line of a log."""
         self.done.append(rows)
         if not self.console.is_terminal:
-            self.line(summary(rows, self.trials))
+            number = best(self.done) if len(rows) == 1 else None
+            self.line(summary(rows, self.trials, number))
         elif note := "  ".join(filter(None, (limits(rows), skipped(rows)))):
             self.line(f"trial {rows[0]['trial']}: {note}")
 
@@ -160,11 +160,15 @@ class Display:
         """The lines of a log, printed by a thread because the phases themselves are at work."""
         while not over.wait(BRIEF / 4):
             now = time.monotonic()
-            fresh = self.stage != self.said and now - self.since > BRIEF and now - self.spoke > BRIEF
+            again, judging = self.stage == self.said, self.clock.trial > len(self.done) + 1
+            # A trial that is still evaluated has its line before the next one does, if that takes no age.
+            fresh = not (again or judging) and now - self.since > BRIEF and now - self.spoke > BRIEF
             if fresh or now - self.spoke > SILENCE:
                 self.said = self.stage
-                left = self.clock.left(self.trials)
-                self.line(self.what if left is None else f"{self.what}  about {duration(left)} left")
+                parts = [self.what, f"{duration(now - self.since)} so far" if again else ""]
+                if (left := self.clock.left(self.trials)) is not None:
+                    parts.append(f"about {duration(left)} left")
+                self.line("  ".join(part for part in parts if part))
 
 
 class Clock:
@@ -224,29 +228,33 @@ def stopped(home: Path) -> str:
     return f"stopped; every finished episode is kept, pegasus-train resume={shlex.quote(str(home))} goes on"
 
 
-def summary(rows: Sequence[dict[str, Any]], trials: int) -> str:
-    """A trial in one line, from the row of each seed; of several seeds the means, and the median of the errors."""
+def summary(rows: Sequence[dict[str, Any]], trials: int, best: int | None = None) -> str:
+    """A trial in one line, from the row of each seed; of several seeds the means, and the median of the errors.
+
+    `best` is the trial with the best policy so far, if that is known.
+    """
     first, several = rows[0], len(rows) > 1
     measured = first["mean_cost"] is not None
     errors = [row["calibration"] for row in rows if row["calibration"] is not None]
     parts = [
         f"trial {first['trial']:>2}/{trials}",
         f"{first['plant_seconds']:.1f} s of plant",
-        f"{executed(rows)}: cost {_mean(rows, 'episode_cost'):.3f}",
+        f"{executed(rows)}: cost {_mean(rows, 'episode_cost'):.3f}{outcome(rows)}",
         learned(rows),
+        f"best so far: trial {best}" if best not in (None, first["trial"]) else "",
         f"{count_solved(rows)} of {len(rows)} seeds solved" if measured and several else "",
         f"model errors {np.median(errors):.1f} times as large as predicted" if errors else "",
         skipped(rows),
         limits(rows),
-        f"(next episode after {waited(first['seconds'])})",
+        f"({waited(first['seconds'])})",
     ]
     return "  ".join(part for part in parts if part)
 
 
 def waited(seconds: dict[str, float]) -> str:
-    """How long a robot waited for its next episode, and a trial for the compiler."""
-    compiling = f"; compiling took {seconds['compile']:.1f} s" if seconds["compile"] >= 0.05 else ""
-    return f"{seconds['between_episodes']:.1f} s{compiling}"
+    """How long a robot stands still until its next episode, and how much of that the compiler takes."""
+    compiling = f", {seconds['compile']:.1f} s of them compiling" if seconds["compile"] >= 0.05 else ""
+    return f"{seconds['between_episodes']:.1f} s until the next episode{compiling}"
 
 
 def executed(rows: Sequence[dict[str, Any]]) -> str:
@@ -259,12 +267,23 @@ def executed(rows: Sequence[dict[str, Any]]) -> str:
     return f"episode by the policy of trial {policies.pop()}" if len(policies) == 1 else "episodes"
 
 
+def outcome(rows: Sequence[dict[str, Any]]) -> str:
+    """How a trial's episodes went, beside their cost: whether they succeeded, and what ended them early."""
+    if "logs" in rows[0] or "ended" not in rows[0]:
+        return ""
+    if len(rows) > 1:
+        return f", {sum(row['episode_success'] for row in rows)} of {len(rows)} succeeded"
+    (row,) = rows
+    early = "" if row["ended"] == "horizon" else f", {row['ended']} after {row['steps']} periods"
+    return early if row["random"] else f"{early}, {'success' if row['episode_success'] else 'no success'}"
+
+
 def learned(rows: Sequence[dict[str, Any]]) -> str:
     """What is known of the policy that a trial ends with: from its evaluation, and from imagined episodes."""
     parts = []
     if rows[0]["mean_cost"] is not None:
         parts += [f"cost {_mean(rows, 'mean_cost'):.3f}", f"success {_mean(rows, 'success_rate'):.0%}"]
-    if (imagined := _mean(rows, "objective_last")) is not None:
+    if (imagined := _mean(rows, "objective_fresh")) is not None:
         parts.append(f"imagined cost {imagined:.3f}")
     kept = all(row.get("replaced") is False for row in rows)
     return f"policy {'kept' if kept else 'now'}: {', '.join(parts)}" if parts else ""

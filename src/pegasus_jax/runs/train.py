@@ -17,7 +17,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from pegasus_jax import episode
-from pegasus_jax.checks import ConfigError, RunError
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config, begins_with_policy, first_search
 from pegasus_jax.experiment import EVALUATE, trial_key
 from pegasus_jax.learn.fit import FitInfo
@@ -90,8 +90,8 @@ def train_seeds(
             if not resume:
                 begin.copy(config, run)
         before = config_io.load(folders[0] / "config.yaml") if resume else config
-        if config.trials < before.trials:
-            raise ConfigError(f"trials={config.trials} is fewer than the run was made for; at least {before.trials}")
+        if (most := max([0, *(trial for run in folders for trial in checkpoint.available(run))])) > config.trials:
+            raise ConfigError(f"trials={config.trials} is fewer than the {most} that are done; expected at least that")
         begun = logged.of_run(config, folders[0]) if resume else logged.of_config(config, logs)
         closing = held.enter_context(ExitStack())  # of what may wait for a network: a robot is let go before
         job = held.enter_context(opened(config, list(runs), mesh, begun))
@@ -101,10 +101,6 @@ def train_seeds(
         for run in folders if resume else ():
             restore.same(run, task)
         stored = restore.together(folders, job.experiment, say) if resume else None
-        if (most := max([0, *(trial for run in folders for trial in checkpoint.available(run))])) > config.trials:
-            raise RunError(
-                f"{folders[0] / 'config.yaml'} has trials={config.trials}, and {most} are done; expected at least that"
-            )
         done = None if stored is None else int(stored.trial[0])
         states = first_states(job, stored, changed=(config.fit, config.search) != (before.fit, before.search))
         if stored is None:
@@ -266,8 +262,9 @@ def improved(
         job.writer.problem(f"trial {trial}: the loss of the model's fit is {loss}, so nothing was learned")
     found = []
     for i in range(program.chunks):
-        cost = np.mean(last(found)) if found else None
-        phase(trial, "search", 0.1 + 0.8 * i / program.chunks, cost)
+        so_far = f", imagined cost {np.mean(last(found)):.3f}" if found else ""
+        note = f", step {i * program.chunk} of {program.chunks * program.chunk}{so_far}"
+        phase(trial, "search", 0.1 + 0.8 * i / program.chunks, note)
         states, searched = program("search", states, np.int32(i * program.chunk))
         found.append(gather(searched))
         program.prepare("succeed", incumbents)  # once; not before the first of the search, for which everybody waits

@@ -38,7 +38,7 @@ def cells(rows: Rows, last: int) -> list[str]:
         _mean(rows, "episode_cost", ".3f"),
         _mean(rows, "mean_cost", ".3f"),
         _mean(rows, "success_rate", ".0%"),
-        _mean(rows, "objective_last", ".3f"),
+        _mean(rows, "objective_fresh", ".3f"),
         f"{np.median(errors):.1f}x" if errors else "-",
         f"{seconds.get('between_episodes', sum(seconds.values())):.0f}",
     ]

@@ -15,6 +15,7 @@ from pegasus_jax.tasks.user_code import blamed, definition, line_of, place_of
 
 UNBOUNDED = 1e6  # limits of an observation beyond this are none
 AROUND = 100  # random points
+FLAT = 1e-3  # a cost that changes by less than this leads nowhere
 NEAR = 1e-3  # of an entry's scale: as near to a point as tells whether the cost is continuous there
 
 
@@ -66,12 +67,27 @@ def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
             f"{what} has a gradient of 0 at each of {len(points)} points{_at(cost)}, so a search has nothing to follow;"
             " for example 1 - jnp.exp(-d**2 / 2), where d is the distance from the goal"
         )
+    found = []
     if values[most] > 1 + 1e-3:
-        return [
+        found.append(
             f"{what} is {values[most]:.3g} at {_text(points[most], facts)}, more than 1: success then means an episode"
-            f" whose last five steps cost less than success={facts.success:g} on average"
-        ]
-    return []
+            f" whose last five steps cost less than success={facts.success:g} on average; 1 - jnp.exp(-cost) is below 1"
+        )
+    if (change := np.ptp(_around(cost, facts))) < FLAT < values[0]:
+        found.append(
+            f"{what} is {values[0]:.3g} where episodes start and changes by {change:.1g} around there: a search finds"
+            " nothing to follow; let it fall from the start to the goal, as a wider exp does"
+        )
+    return found
+
+
+def _around(cost: Callable[[Any], Any], facts: Facts) -> np.ndarray:
+    """The cost [AROUND] within the size of each entry around the start: angles within a quarter of a turn."""
+    size = scales(facts)
+    size[list(facts.angles)] = np.pi / 2
+    away = np.random.default_rng(2).uniform(-1, 1, (AROUND, len(size)))
+    points = np.asarray(facts.start_mean) + size * away
+    return np.asarray(jax.vmap(lambda x: jnp.asarray(cost(x), float))(jnp.asarray(points, float)), np.float64)
 
 
 def _evaluated(cost: Callable[[Any], Any], facts: Facts, what: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -145,8 +161,8 @@ def _traced(cost: Callable[[Any], Any], facts: Facts, what: str) -> None:
         raise
     for index, length, line in beyond(traced):
         raise ConfigError(
-            f"{what} reads entry {index} of {length}{_in(line)}, where JAX takes another; x has {observed},"
-            f" 0 to {observed - 1}"
+            f"{what} reads entry {index} of an array of {length}{_in(line)}; x has {observed}, 0 to {observed - 1}, and"
+            " rates behind them with sensors.velocity="
         )
 
 

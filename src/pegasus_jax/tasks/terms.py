@@ -185,6 +185,6 @@ def box(task: Task) -> np.ndarray:
         seen = draws(task.goal.value)
         known |= dict(zip(goal_names(task), zip(seen.min(0), seen.max(0), strict=True), strict=True))
     ends = np.array([known.get(name, (-np.inf, np.inf)) for name in task.memory.names], float).reshape(-1, 2)
-    bounded = np.isfinite(ends).all(1)
-    mean, std = np.where(bounded, ends.sum(1) / 2, 0.0), np.where(bounded, np.ptp(ends, 1) / 4, 1.0)
-    return np.stack([mean, std, *ends.T])
+    bounded = np.isfinite(ends).all(1, keepdims=True)
+    finite = np.where(bounded, ends, [-2.0, 2.0])  # else a mean of 0 and a deviation of 1
+    return np.stack([finite.sum(1) / 2, np.ptp(finite, 1) / 4, *ends.T])
