@@ -20,6 +20,7 @@ from pegasus_jax.exports import as_c, write
 from pegasus_jax.imagine import matching
 from pegasus_jax.imagine.rollout import rollout
 from pegasus_jax.learn.fit import FitInfo
+from pegasus_jax.math.units import rate_of
 from pegasus_jax.models.smoothed import alternating, corrected, draw_rates
 from pegasus_jax.policies.rate_limited import rate_limited
 from pegasus_jax.runs import config_io
@@ -303,6 +304,7 @@ def test_an_environment_gets_rates_as_a_robot_computes_them():
     )
     task = tasks.of_config(tasks.resolve(config))
     assert (task.state_names, task.rates) == (("x1", "rate of x1"), (1,))
+    assert [*map(rate_of, ("x [m]", "swing [rad]"))] == ["rate of x [m/s]", "rate of swing [rad/s]"]
     np.testing.assert_array_equal(task.start_mean, [1, 0])
     config = tiny(
         sensors=config.sensors, search__steps=2, search__cost_width_start=1.0, fit__steps=2, trials=2, **PLAIN

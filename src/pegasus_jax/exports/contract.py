@@ -1,7 +1,6 @@
 """What whoever drives the robot must know of an exported controller, as JSON: names, units, order, limits, period."""
 
 import hashlib
-import re
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +8,7 @@ import numpy as np
 
 from pegasus_jax.exports.learned import Learned
 from pegasus_jax.exports.parity import Parity
+from pegasus_jax.math.units import parted
 from pegasus_jax.memory import resting
 from pegasus_jax.runs.machine import about
 from pegasus_jax.tasks.remembered import kept_by
@@ -64,5 +64,4 @@ def _memory(learned: Learned) -> dict[str, Any]:
 
 def named(name: str) -> dict[str, Any]:
     """A name and its unit, which is null where it is not known: "theta [rad]" is theta in rad."""
-    found = re.fullmatch(r"(.*?)\s*\[([^\[\]]*)\]", name)
-    return {"name": found[1], "unit": found[2]} if found else {"name": name, "unit": None}
+    return dict(zip(("name", "unit"), parted(name), strict=True))

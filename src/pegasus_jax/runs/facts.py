@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pegasus_jax.checks import RunError
+from pegasus_jax.math.units import rate_of
 
 if TYPE_CHECKING:
     from pegasus_jax.task import Task
@@ -132,6 +133,15 @@ def difference(stored: dict[str, Any], made: dict[str, Any]) -> str | None:
         if not _same(one, other):
             return f"its {name} was {_short(one)} and now is {_short(other)}"
     return None
+
+
+def of_today(found: Any) -> Any:
+    """The facts of a task with today's names: of an earlier version the rate of "x [m]" was one "of x [m]"."""
+    names = found.get("state_names") if isinstance(found, dict) else None
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        return found
+    before = {f"rate of {name}": rate_of(name) for name in names}
+    return found | {"state_names": [before.get(name, name) for name in names]}
 
 
 def _same(one: Any, other: Any) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math.angles import difference, encode
+from pegasus_jax.math.units import rate_of
 from pegasus_jax.memory import combined, past_controls, resting
 from pegasus_jax.task import Task
 from pegasus_jax.types import Array, Hindsight, Memory
@@ -101,6 +102,7 @@ def velocities(task: Task, weight: float) -> Memory:
     positions, n = np.array(measured), len(measured)
     turning = tuple(place for place, i in enumerate(measured) if i in task.angles)
     names = tuple(task.state_names[i] for i in measured)
+    rates = tuple(map(rate_of, names))
 
     def filtered(m: Array, o: Array) -> Array:
         now = difference(o[positions], m[:n], turning) / task.dt
@@ -110,10 +112,10 @@ def velocities(task: Task, weight: float) -> Memory:
         return jnp.concatenate([o[positions], *([filtered(m, o)] if weight < 1 else [])])
 
     return Memory(
-        names=(*(f"{name} 1 before" for name in names), *(f"filtered rate of {name}" for name in names * (weight < 1))),
+        names=(*(f"{name} 1 before" for name in names), *(f"filtered {rate}" for rate in rates * (weight < 1))),
         start=lambda key, o: jnp.concatenate([o[positions], jnp.zeros(n * (weight < 1), o.dtype)]),
         advance=advance,
-        shown=tuple(f"measured rate of {name}" for name in names),
+        shown=tuple(f"measured {rate}" for rate in rates),
         show=filtered,
         measured=measured,
     )

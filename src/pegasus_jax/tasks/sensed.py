@@ -12,6 +12,7 @@ from pegasus_jax import memory
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Sensors
 from pegasus_jax.math.circles import Circles, to_observation, to_state
+from pegasus_jax.math.units import rate_of
 from pegasus_jax.memory import resting
 from pegasus_jax.task import Task
 from pegasus_jax.tasks.terms import alone
@@ -224,7 +225,7 @@ def with_rates(task: Task, velocity: str) -> Task:
     return task._replace(
         environment=environment._replace(reset=lambda seed: state(environment.reset(seed), True), step=step),
         rates=tuple(range(n, 2 * n)),
-        state_names=(*task.state_names, *(f"rate of {name}" for name in task.state_names)),
+        state_names=(*task.state_names, *map(rate_of, task.state_names)),
         starts=None if task.starts is None else grown(task.starts),
         **{name: grown(getattr(task, name)) for name in ("start_mean", "start_std", "sensor_std")},
     )
