@@ -13,7 +13,7 @@ import pytest
 
 import pegasus_jax
 from folders import a_run
-from pegasus_jax.checks import RunError
+from pegasus_jax.checks import ConfigError, RunError, brief
 from pegasus_jax.runs import store
 from pegasus_jax.runs.restore import precision, restored
 
@@ -53,6 +53,22 @@ assert control({X.tolist()}).dtype == "float32"
 assert jnp.zeros(()).dtype == "float64"
 """
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_mistake_is_told_without_the_calls_inside(tmp_path: Path) -> None:
+    """A user sees his own line and the message; what caused an error of his own code stays."""
+    with pytest.raises(RunError, match="hovr is not a run") as caught:
+        pegasus_jax.controller(tmp_path / "hovr")
+    ours = [entry for entry in caught.traceback if "pegasus_jax" in str(entry.path) and "src" in entry.path.parts]
+    assert (len(ours), caught.value.__cause__) == (1, None)
+
+    @brief
+    def fails() -> None:
+        raise ConfigError("cost=mine:cost cannot be traced") from ZeroDivisionError("of the user")
+
+    with pytest.raises(ConfigError) as refused:
+        fails()
+    assert isinstance(refused.value.__cause__, ZeroDivisionError)
 
 
 def test_a_trial_is_chosen(runs: dict[str, Path]) -> None:

@@ -6,9 +6,13 @@ import math
 import numbers
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from functools import wraps
 from pathlib import PureWindowsPath
 from types import GenericAlias, UnionType
-from typing import Any, get_args
+from typing import Any, ParamSpec, TypeVar, get_args
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 # The greatest of each size that a setting may ask for: beyond is a slip of the keyboard, and no machine's work.
 SIZES = {
@@ -37,6 +41,22 @@ class ConfigError(ValueError):
 
 class RunError(Exception):
     """A run's folder is not as it should be; the message is one line for the person who named it."""
+
+
+def brief(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, whose ConfigError and RunError come without the calls inside of it: their line says it all.
+
+    What caused them, such as an error of the user's own code, stays, and so does every other error.
+    """
+
+    @wraps(function)
+    def called(*args: P.args, **kwargs: P.kwargs) -> R:
+        try:
+            return function(*args, **kwargs)
+        except (ConfigError, RunError) as error:
+            raise error.with_traceback(None) from error.__cause__
+
+    return called
 
 
 def did_you_mean(name: str, choices: Iterable[str]) -> str:

@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax.checks import SIZES, ConfigError, check_range
+from pegasus_jax.checks import SIZES, ConfigError, brief, check_range
 from pegasus_jax.config import Config, label
 from pegasus_jax.runs import trackers
 
@@ -29,6 +29,7 @@ class Asked(NamedTuple):
     track: tuple[str, ...] | None = None  # the trackers; None: those of before
 
 
+@brief
 def preset(
     name: str = "cartpole",
     *,
@@ -49,6 +50,7 @@ def preset(
     return config_io.parse({word: value for word, value in said.items() if value is not None} | dict(settings or {}))
 
 
+@brief
 def train(
     config: Config | str | None = None,
     *,

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pegasus_jax.checks import ConfigError, choice
+from pegasus_jax.checks import ConfigError, brief, choice
 from pegasus_jax.exports import as_c, as_numpy, as_onnx, as_stablehlo
 from pegasus_jax.exports.asked import observed
 from pegasus_jax.exports.contract import contract
@@ -39,6 +39,7 @@ FORMATS = {
 }
 
 
+@brief
 def export(
     run: str | Path,
     trial: restore.Trial = restore.BEST,

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pegasus_jax import memory as recall
+from pegasus_jax.checks import brief
 from pegasus_jax.memory import seen_names
 from pegasus_jax.runs import restore
 from pegasus_jax.tasks import sensed
@@ -112,6 +113,7 @@ def _numbers(values: ArrayLike, size: int, what: str, kind: type) -> np.ndarray:
     return found
 
 
+@brief
 def controller(run: str | Path, trial: restore.Trial = restore.BEST) -> Controller:
     """The policy of a run after a trial, finished run or not: a number, "last", or "best" (`record.best_trial`).
 
