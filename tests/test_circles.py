@@ -193,4 +193,4 @@ def test_a_plant_seen_by_cosine_and_sine_is_learned_as_if_seen_by_its_angle(tmp_
     assert (kept.circles, len(kept.starts)) == (((0, 1),), 100)
     train(replace(kept, trials=3), first, resume=True)
     assert len(store.trials(first)) == 3
-    assert evaluate_run(first, 2, 0)["trial"] == 3
+    assert evaluate_run(first, 2, 0, 3)["trial"] == 3

@@ -1,5 +1,6 @@
 """What lies in a run's folder, made usable again; and what of it is never executed."""
 
+import inspect
 import json
 import os
 import shutil
@@ -14,8 +15,14 @@ from folders import a_run
 from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError, RunError
+from pegasus_jax.cli import runs as commands
+from pegasus_jax.cli.words import OF_RUN
+from pegasus_jax.exports.drive import drives
+from pegasus_jax.exports.write import export
 from pegasus_jax.learn.data import grow
-from pegasus_jax.runs import checkpoint, config_io, restore, store
+from pegasus_jax.runs import checkpoint, config_io, evaluation, restore, store
+from pegasus_jax.runs.controller import controller
+from pegasus_jax.viz.video import film
 from test_train import call
 
 
@@ -48,6 +55,16 @@ def test_the_facts_of_a_task_make_the_same_experiment(run: Path) -> None:
     assert restore.same(run, real.task) is None
     with pytest.raises(RunError, match="its control_high was"):
         restore.same(run, real.task._replace(control_high=np.array([11.0])))
+
+
+def test_a_run_whose_rates_had_the_units_of_positions_is_the_same_run(run: Path) -> None:
+    """As versions before called them."""
+    about = json.loads((run / "run.json").read_text())
+    now = about["task"] | {"state_names": ["a [m]", "rate of a [m/s]", "b", "rate of b"]}
+    about["task"] = now | {"state_names": ["a [m]", "rate of a [m]", "b", "rate of b"]}
+    (run / "run.json").write_text(json.dumps(about))
+    assert store.stored(run)["task"] == now
+    assert store.task_of(run).state_names[1] == "rate of a [m/s]"
 
 
 def test_a_state_of_other_settings_is_refused_with_the_difference(run: Path) -> None:
@@ -115,6 +132,11 @@ def test_a_run_goes_on_from_where_its_rows_end(run: Path) -> None:
 def test_the_last_episode_counts_though_it_has_no_row(run: Path) -> None:
     """The policy after the last trial is the best as soon as its own episode says so."""
     assert restore.best(run) == 2
+    assert restore.chosen(run, "best", 2) == "best policy: trial 2 (cost 0.700 in 1 of the episodes)"
+    assert [restore.chosen(run, asked, 3) for asked in ("last", 3)] == [
+        "newest policy: trial 3",
+        "policy of trial 3, as asked",
+    ]
     task, cheap = store.task_of(run), store.load_episode(run, 3)
     assert cheap is not None
     good = cheap.trajectory._replace(cost=0.01 * cheap.trajectory.cost)
@@ -126,6 +148,27 @@ def test_the_last_episode_counts_though_it_has_no_row(run: Path) -> None:
     short = good._replace(x=good.x[:3], u=good.u[:2], cost=good.cost[:2])
     store.save_episode(run, 4, short, task, policy=3, ended="terminated")
     assert restore.best(run) == 2
+    store.save_episode(run, 4, good, task, policy=3, ended="horizon")
+    shutil.rmtree(run / "checkpoints" / "0003")
+    (run / "checkpoints" / "0003.json").unlink()
+    assert restore.best(run) == 2  # while a run goes on, its newest row is there before the checkpoint is
+
+
+def test_every_command_takes_the_best_policy(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert {given["trial"] for given in OF_RUN.values() if "trial" in given} == {"best"}
+    for function in (evaluation.evaluate_run, film, drives, export, controller):
+        assert inspect.signature(function).parameters["trial"].default == "best"
+    told = {"trial": 2, "episodes": 20, "mean_cost": 0.3330841660499573, "success_rate": 0.95, "fingerprint": "3f87"}
+    monkeypatch.setattr(evaluation, "evaluate_run", lambda *given: told)
+    commands.evaluate([str(run)])
+    assert capsys.readouterr().out.splitlines() == [
+        "best policy: trial 2 (cost 0.700 in 1 of the episodes)",
+        "20 episodes: mean cost 0.333, success 95%",
+    ]
+    commands.evaluate([str(run), "json=true"])
+    assert json.loads(capsys.readouterr().out) == told
 
 
 def test_nothing_is_imported_from_inside_a_run(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -234,7 +234,7 @@ def test_a_folder_of_seeds_is_drawn_and_kept(study: Path) -> None:
     named = call("evaluate", study, cwd=study.parent)
     assert named.returncode == 2
     assert "seed1" in named.stderr
-    evaluated = call("evaluate", study / "seed2", "episodes=1", "json=true", cwd=study.parent)
+    evaluated = call("evaluate", study / "seed2", "trial=last", "episodes=1", "json=true", cwd=study.parent)
     assert json.loads(evaluated.stdout)["trial"] == 2
 
 

@@ -187,7 +187,7 @@ def test_checkpoints_of_another_structure_leave_the_episodes(whole: Path, tmp_pa
     run = copy_until(whole, tmp_path / "run", 2)
     config = config_io.load(run / "config.yaml")
     config_io.save(config_io.override(config, {"model.hidden": [17]}), run / "config.yaml")
-    refused = call("evaluate", str(run), cwd=tmp_path)
+    refused = call("evaluate", str(run), "trial=last", cwd=tmp_path)
     assert refused.returncode == 2
     assert "no checkpoint that this version can use" in refused.stderr
     assert re.search(
@@ -304,7 +304,7 @@ def test_two_processes_cannot_write_to_one_run(whole: Path, tmp_path: Path) -> N
 def test_eval_and_plot_work_while_a_run_goes_on(whole: Path, tmp_path: Path) -> None:
     run = copy_until(whole, tmp_path / "run", 2)
     with store.lock(run):
-        evaluated = call("evaluate", run, "episodes=2", "json=true", cwd=tmp_path)
+        evaluated = call("evaluate", run, "trial=last", "episodes=2", "json=true", cwd=tmp_path)
         plotted = call("plot", run, cwd=tmp_path)
     told = json.loads(evaluated.stdout)
     assert (told["trial"], told["fingerprint"]) == (2, fingerprint(run))

@@ -43,7 +43,9 @@ def called(what: str, run: Path) -> Outcome:
     """One of the commands on the damaged run."""
     if what == "resume":
         return common.command("pegasus-train", f"resume={run.name}", cwd=run.parent)
-    return common.command(f"pegasus-{what}", run.name, *(["episodes=1"] if what == "eval" else []), cwd=run.parent)
+    return common.command(
+        f"pegasus-{what}", run.name, *(["trial=last", "episodes=1"] if what == "eval" else []), cwd=run.parent
+    )
 
 
 def names_it(damage: Damage, line: str) -> bool:

@@ -75,8 +75,8 @@ def leftovers(run: Path) -> list[str]:
 
 
 def fingerprint(run: Path) -> str:
-    """What pegasus-eval says of a run, or how it failed."""
-    ended = common.command("pegasus-eval", run, "episodes=1", "json=true", cwd=run.parent)
+    """What pegasus-eval says of the end of a run, or how it failed."""
+    ended = common.command("pegasus-eval", run, "trial=last", "episodes=1", "json=true", cwd=run.parent)
     try:
         return json.loads(ended.out.splitlines()[-1])["fingerprint"]
     except (IndexError, ValueError, KeyError):

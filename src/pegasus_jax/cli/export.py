@@ -41,11 +41,13 @@ def handle(words: Sequence[str]) -> None:
         raise ConfigError(f"overwrite={rest['overwrite']} is neither true nor false")
     trial = trial_of(rest["trial"])
     from pegasus_jax.exports import write
+    from pegasus_jax.runs.restore import chosen
 
     file = write.export(run, trial, rest["format"], rest["out"] or None, rest["overwrite"] == "true")
     contract = json.loads(write.contract_of(file).read_bytes())
     parity = contract["parity"]
     print(f"{file}: {contract['title']}")
+    print(chosen(run, trial, contract["trial"]))
     print(f"{write.contract_of(file)}: its contract")
     seen, stored = (f"{parity[name]:,}" for name in ("observations", "stored"))
     print(f"{seen} observations, {stored} of them stored: it differs from the policy by at most", end=" ")

@@ -59,12 +59,13 @@ examples
 """
 
 EVALUATE = """\
-pegasus-eval RUN [trial=last] [episodes=20] [seed=0] [json=true]     run a learned policy on its plant
+pegasus-eval RUN [trial=best] [episodes=20] [seed=0] [json=true]     run a learned policy on its plant
 
-Uses the policy after trial=N, trial=best or the last trial, and episodes that never become data. mjcf=FILE names the
+Uses the policy after trial=N, trial=last or the best trial, and episodes that never become data. mjcf=FILE names the
 model's file where it was moved.
-Prints mean cost per step, success rate (last five steps cost less than .2 on average) and the run's fingerprint:
-SHA-256 over data, model and policy parameters. With json=true, one JSON object.
+Prints whose policy it is, mean cost per step and success rate (last five steps cost less than .2 on average). With
+json=true, one JSON object: in full, and with a fingerprint, the SHA-256 of data, model and policy, by which two runs
+can be told to be the same.
 """
 
 PLOT = """\
@@ -77,10 +78,10 @@ seed's raw curve thin, their interquartile mean thick with its 95 % bootstrap in
 """
 
 PLAY = """\
-pegasus-play RUN [trial=last] [episodes=1] [seed=0]     film a learned policy on its plant
+pegasus-play RUN [trial=best] [episodes=1] [seed=0]     film a learned policy on its plant
 
 Drives the run's environment, which is opened with render_mode="rgb_array", or simulates its plant.
-Writes RUN/play.mp4: fresh episodes of the newest whole checkpoint of the run, finished or not, in real time,
+Writes RUN/play.mp4: fresh episodes of the best policy, or that after trial=N or trial=last, in real time,
 20 pictures a second, with cost and command drawn below as they come about. Another seed= gives other starts and
 other noise. No display is needed: OpenGL comes from EGL or OSMesa, and MUJOCO_GL=egl|osmesa|glfw chooses; without
 a graphics card a picture takes a tenth of a second or two, so a minute for the swimmer's 20 s.

@@ -21,7 +21,7 @@ Of a folder, such as a sweep's, the runs in it and in its folders: those that di
 interquartile means and their 95 % bootstrap intervals, and every seed's raw curve. Nothing is trained.
 
   out=FILE      where the page is written (of several runs without a folder for all: report.html)
-  film=true     film the best policy first, as pegasus-play RUN trial=best does; of one run
+  film=true     film the best policy first, as pegasus-play RUN does; of one run
   csv=FOLDER    write every curve there as CSV too; the page has them as links
 
 examples

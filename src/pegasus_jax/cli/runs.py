@@ -15,12 +15,15 @@ def evaluate(words: Sequence[str]) -> None:
     if rest["json"] not in ("true", "false"):
         raise ConfigError(f"json={rest['json']} is neither true nor false")
     from pegasus_jax.runs.evaluation import evaluate_run
+    from pegasus_jax.runs.restore import chosen
 
-    result = evaluate_run(run, episodes, seed, trial_of(rest["trial"]), rest["mjcf"] or None)
+    trial = trial_of(rest["trial"])
+    result = evaluate_run(run, episodes, seed, trial, rest["mjcf"] or None)
     if rest["json"] == "true":
         print(json.dumps(result))
     else:
-        print("\n".join(f"{name:>13}  {value}" for name, value in result.items()))
+        print(chosen(run, trial, result["trial"]))
+        print(f"{episodes} episodes: mean cost {result['mean_cost']:.3f}, success {result['success_rate']:.0%}")
 
 
 def plot(words: Sequence[str]) -> None:

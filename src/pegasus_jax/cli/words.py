@@ -117,11 +117,11 @@ PATHS = ("out", "resume", "init", "explore.policy", "data", "mjcf", "reference",
 
 # The options of the commands that read a run, with their defaults.
 OF_RUN: dict[str, dict[str, str]] = {
-    "pegasus-eval": {"episodes": "20", "seed": "0", "json": "false", "trial": "last", "mjcf": ""},
+    "pegasus-eval": {"episodes": "20", "seed": "0", "json": "false", "trial": "best", "mjcf": ""},
     "pegasus-plot": {},
     "pegasus-report": {"out": "", "film": "false", "csv": ""},
     "pegasus-watch": {"port": "8765"},
-    "pegasus-play": {"episodes": "1", "seed": "0", "trial": "last", "mjcf": ""},
+    "pegasus-play": {"episodes": "1", "seed": "0", "trial": "best", "mjcf": ""},
     "pegasus-export": {"trial": "best", "format": "numpy", "out": "", "overwrite": "false"},
     "pegasus-run": {"trial": "best", "episodes": "1", "seed": "0", "seconds": "", "watchdog": ""},
 }

@@ -62,7 +62,7 @@ def evaluate_run(
     run: Path,
     episodes: int,
     seed: int,
-    trial: restore.Trial = restore.LAST,
+    trial: restore.Trial = restore.BEST,
     mjcf: str | None = None,
 ) -> dict[str, Any]:
     """How the policy of a trial does on its plant, and the run's fingerprint then.

@@ -24,6 +24,7 @@ from pegasus_jax.config import Config
 from pegasus_jax.episode import verdict
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.runs import checkpoint, config_io, facts, logged, store
+from pegasus_jax.runs.display import best_line
 from pegasus_jax.task import Task
 from pegasus_jax.types import RunState, TrainState
 
@@ -74,9 +75,11 @@ def _state(run: Path, trial: Trial, like: RunState) -> RunState:
 
 def best(run: Path) -> int:
     """The trial after which the best policy of a run was learned. Raises RunError before its first trial has ended."""
-    rows = store.trials(run)
+    rows, there = store.trials(run), checkpoint.available(run)
     if not rows:
         raise RunError(f"{run / 'trials.jsonl'} holds no finished trial yet")
+    if len(rows) > 1 and len(rows) not in there and len(rows) - 1 in there:  # its checkpoint is being written
+        rows.pop()
     following = len(rows) + 1
     ran, origin = store.load_episode(run, following), store.origin(run, following)
     last = None
@@ -88,9 +91,16 @@ def best(run: Path) -> int:
             **verdict(ran, store.task_of(run)),
         }
     try:
-        return store.best_trial(rows, last, first=0 if 0 in checkpoint.available(run) else 1)
+        return store.best_trial(rows, last, first=0 if 0 in there else 1)
     except (KeyError, TypeError) as error:
         raise RunError(f"{run / 'trials.jsonl'} has rows that this version cannot judge") from error
+
+
+def chosen(run: Path, trial: Trial, number: int) -> str:
+    """Which policy a command uses that was asked for `trial`, and why, in one line; `number` is its trial."""
+    if trial == BEST:
+        return best_line(store.trials(run), number)
+    return f"newest policy: trial {number}" if trial == LAST else f"policy of trial {number}, as asked"
 
 
 def newest(runs: Sequence[Path], like: RunState, candidates: Sequence[int]) -> tuple[RunState | None, list[str]]:

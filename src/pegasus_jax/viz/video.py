@@ -1,6 +1,7 @@
-"""A film of a run's newest policy on its plant, with cost and command drawn below as they come about."""
+"""A film of a run's policy on its plant, with cost and command drawn below as they come about."""
 
 import os
+import sys
 from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import count
@@ -45,13 +46,14 @@ class Strip(NamedTuple):
     bottom: int  # last row of the axes
 
 
-def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.LAST, mjcf: str | None = None) -> Path:
+def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.BEST, mjcf: str | None = None) -> Path:
     """Write RUN/play.mp4: `episodes` episodes that are not data, one after the other, in real time.
 
     An environment is opened for it with render_mode="rgb_array". Raises ConfigError for one that does not render.
     """
     config, experiment, state = restore.ready(run, trial, mjcf)
     task, number = experiment.task, int(state.trial)
+    print(restore.chosen(run, trial, number), file=sys.stderr)
     if task.environment is None:
         perform = jax.jit(partial(performance, task=task, policy=experiment.policy))
         keys = jax.random.split(jax.random.key(seed), episodes)
@@ -137,7 +139,7 @@ def strip(trajectory: Trajectory, task: Task, title: str) -> Strip:
     figure.subplots_adjust(left=0.11, right=0.97, top=0.87, bottom=0.2, hspace=0.2)
     above.plot(times[1:], cost, color=COST, linewidth=1.5)
     above.set(ylim=(-0.05, 1.05), xlim=(0, times[-1]))
-    above.set_title(f"{title}: mean cost {cost.mean():.3f}", fontsize=8)
+    above.set_title(f"{title}: mean cost {episode.charged(cost, task).mean():.3f}", fontsize=8)
     below.step(times, np.concatenate([u, u[-1:]]), where="post", linewidth=1.0)
     margin = 0.05 * (high.max() - low.min())
     below.set_ylim(low.min() - margin, high.max() + margin)
