@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,12 +15,14 @@ import numpy as np
 import pytest
 
 import pegasus_jax
-from folders import TINY, a_run
+from folders import TINY, a_run, row
 from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.drive import handle
 from pegasus_jax.exports.drive import drives, overruns, timed
-from pegasus_jax.runs import config_io
+from pegasus_jax.report import content
+from pegasus_jax.report.read import look
+from pegasus_jax.runs import config_io, store
 
 ROBOT = """
 import os, signal, time
@@ -135,6 +138,17 @@ def test_a_robot_is_driven_by_the_policy_at_its_period(home: Path) -> None:
     assert log["time"][0] == 0
     assert log["time"][-1] > 13.9 * 0.02  # its step does not wait
     assert int(log["overruns"]) == overruns(log["time"], 0.02)
+    assert "policy of trial 1, as asked" in done.err.splitlines()
+    report = " ".join(re.sub("<[^>]*>", " ", content.driven.section(look(home / "run"))).split())
+    late = int(log["overruns"])
+    assert f"driven/0002.npz trial 1 0.3 {log['cost'].mean():.3f} no horizon {late}" in report
+    cut = store.arrays(home / "run" / "driven" / "0002.npz") | {"trial": 3, "ended": "interrupted"}
+    np.savez(home / "run" / "driven" / "0003.npz", **cut)
+    best = content.best(look(home / "run")._replace(best=1, rows=[row(1)], steps=[]))
+    assert "driven 3 times by pegasus-run, 1 of them cut short: cost 1.000, 0 of 2 succeeded" in best
+    (home / "run" / "driven" / "0003.npz").write_bytes(b"no log")
+    assert any("0003.npz cannot be read" in problem for problem in look(home / "run").problems)
+    (home / "run" / "driven" / "0003.npz").unlink()
 
 
 @pytest.mark.slow

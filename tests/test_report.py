@@ -17,16 +17,19 @@ import numpy as np
 import pytest
 
 import browser
-from folders import TINY, a_run, row
+from folders import TINY, a_run, episode, row
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli import report as command
 from pegasus_jax.cli import runs as commands
+from pegasus_jax.episode import Episode, verdict
+from pegasus_jax.math.window import window
 from pegasus_jax.report import build, chart
 from pegasus_jax.report.chart import Level, Line
 from pegasus_jax.report.findings import findings
 from pegasus_jax.report.page import page
 from pegasus_jax.report.read import Look, coverage, look, settings
 from pegasus_jax.runs import config_io, groups, store
+from pegasus_jax.viz import run_plots
 
 STEPS, PARTICLES = 25, 30
 KNOWN = dict(calibration=1.1, saturated=0.1, skipped_updates=0, replaced=True, mean_cost=0.5, success_rate=0.6)
@@ -46,7 +49,8 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     made = a_run(tmp_path_factory.mktemp("report") / "run")
     for trial in (1, 2, 3):
         imagined(made, trial)
-    store.write_trials(made, [row(trial, **KNOWN, seconds={"fit": 2.0, "compile": 1.0}) for trial in (1, 2, 3)])
+    seconds = {"collect": 5.0, "fit": 2.0, "compile": 1.0, "between_episodes": 8.0}
+    store.write_trials(made, [row(trial, **KNOWN, seconds=seconds) for trial in (1, 2, 3)])
     return made
 
 
@@ -123,6 +127,8 @@ def test_a_run_is_one_page_with_every_curve(run: Path) -> None:
         assert title in text
     for name in ("theta' [rad/s]", "force [N]", "plant time [s]", "time [s]", "cost a period"):
         assert name in text
+    assert text.count("2 + 1") == 3  # waiting between two episodes is made of the other seconds
+    assert "computing time 9 s" in text
     assert {f"trial-{n}" for n in (1, 2, 3, 4)} <= {*found.ids}  # the fourth is imagined and has not been run
     trials, trajectories = map(table, inside(found, "text/csv"))
     assert [float(one["episode_cost"]) for one in trials] == [one["episode_cost"] for one in store.trials(run)]
@@ -133,6 +139,39 @@ def test_a_run_is_one_page_with_every_curve(run: Path) -> None:
     np.testing.assert_allclose([float(one["real"]) for one in angles], real, rtol=1e-5)
     np.testing.assert_allclose([float(one["time [s]"]) for one in angles], 0.1 * np.arange(STEPS + 1), rtol=1e-5)
     np.testing.assert_allclose([float(o["imagined_5_percent"]) for o in angles], np.quantile(fan, 0.05, 1), rtol=1e-5)
+
+
+def test_an_episode_has_one_cost_on_the_page_and_says_that_it_ended_early(run: Path, tmp_path: Path) -> None:
+    copy = shutil.copytree(run, tmp_path / "run")
+    task = store.task_of(copy)
+    for trial, ended, expected in ((2, "terminated", 1 - 0.9 * 5 / 25), (3, "interrupted", 0.1)):
+        ran = episode(task, trial, 5)._replace(cost=np.full(5, 0.1, np.float32))
+        store.save_episode(copy, trial, ran, task, policy=trial - 1, ended=ended)
+        rows = store.trials(copy)
+        rows[trial - 1] |= verdict(Episode(ran, ended), task) | {"ended": ended}
+        store.write_trials(copy, rows)
+        text = " ".join(whole(html(copy)).words)
+        assert f"policy of trial {trial - 1}, cost {expected:.3f}" in text  # the heading of its charts
+        assert f"policy of trial {trial - 1}, {ended} {expected:.3f}" in text  # the table
+
+
+def test_a_picture_reaches_as_far_as_its_episode_needs() -> None:
+    time = np.linspace(0, 1, 50)
+    real, narrow = np.sin(6 * time), np.sin(6 * time)[:, None] + 0.3 * np.linspace(-1, 1, 100)
+    low, high = window(real, narrow) or (0, 0)
+    assert -1.45 < low < np.percentile(narrow, 5, axis=1).min() < np.percentile(narrow, 95, axis=1).max() < high < 1.45
+    stray = narrow.copy()
+    stray[:, :3] = 2000 * time[:, None]
+    stray[-1, 3] = np.nan
+    assert window(real, stray) == pytest.approx((low, high), abs=0.1)
+    flying = narrow + 1e6 * time[:, None] ** 6 * np.linspace(0, 1, 100)
+    low, high = window(real, flying) or (0, 0)
+    assert (low < real.min(), real.max() < high) == (True, True)
+    assert high - low < 10 * np.ptp(real)
+    assert window(None, narrow) == pytest.approx(window(real, narrow), abs=0.05)
+    assert window(np.array([0.0, np.nan, 1.0]), None) == pytest.approx((-0.06, 1.06))
+    assert window(None, None) is None
+    assert window(np.zeros(3), np.zeros((3, 4)), -5.0, 5.0) == pytest.approx((-5.6, 5.6))
 
 
 def test_names_of_a_user_are_text(run: Path, tmp_path: Path) -> None:
@@ -203,6 +242,28 @@ def test_the_share_inside_the_band_is_that_of_the_states(run: Path) -> None:
     turned[:, 3] += 4 * np.pi  # the same angle
     again = step.real._replace(trajectory=step.real.trajectory._replace(x=turned))
     assert coverage(step._replace(real=again), found.task) == coverage(step, found.task)
+
+
+def drawn_of(rows: list[dict[str, Any]], monkeypatch: pytest.MonkeyPatch) -> list[dict[str, list[float]]]:
+    """What learning.png has in its upper and in its lower axes: the heights of each line by its label."""
+    figures: list[Any] = []
+    monkeypatch.setattr(run_plots, "_save", lambda figure, path: figures.append(figure))
+    run_plots.learning(rows, Path("learning.png"))
+    (figure,) = figures
+    return [{str(line.get_label()): list(line.get_ydata()) for line in axis.lines} for axis in figure.axes]
+
+
+def test_the_learning_curve_of_a_robot_shows_its_own_episodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without an evaluation: whether each succeeded, and which of them ended early."""
+    rows = [row(n, episode_success=n == 3, ended="interrupted" if n == 2 else "horizon") for n in (1, 2, 3)]
+    above, below = drawn_of(rows, monkeypatch)
+    assert above["plant, the trial's episode"] == [0.9, 0.8, 0.7]
+    assert above["plant, an episode that ended early"] == [0.8]
+    assert [*below.values()] == [[0, 0, 1], [0]]
+    above, below = drawn_of([row(n, **KNOWN) for n in (1, 2)], monkeypatch)
+    assert (len(above), [*below.values()]) == (3, [[0.6, 0.6]])
+    without = [{name: v for name, v in row(1).items() if name not in ("ended", "episode_success")}]  # of an old version
+    assert np.isnan(next(iter(drawn_of(without, monkeypatch)[1].values()))).all()
 
 
 def test_a_chart_puts_numbers_where_they_belong() -> None:

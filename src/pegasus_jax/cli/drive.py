@@ -43,8 +43,10 @@ def handle(words: Sequence[str]) -> None:
 
     given = dict(episodes=episodes, seed=seed, seconds=seconds, watchdog=watchdog)
     for done in drives(folder, trial, **given):  # type: ignore[arg-type]
-        count, cost = len(done.times), float(done.episode.trajectory.cost.mean())
-        print(f"{done.log}: {count} controls, mean cost {cost:.3f}, ended by {done.episode.ended};", end=" ")
+        print(
+            f"{done.log}: {len(done.times)} controls, mean cost {done.cost:.3f}, ended by {done.episode.ended};",
+            end=" ",
+        )
         longest = f"the longest of {done.period:g} s took {done.longest:.4g} s"
         print(f"{done.overruns} overruns, {longest}", flush=True)
 

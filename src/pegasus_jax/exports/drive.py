@@ -14,18 +14,17 @@ import numpy as np
 
 from pegasus_jax import interrupt, tasks
 from pegasus_jax.checks import ConfigError, RunError, check_range
-from pegasus_jax.episode import Episode, drive, states
+from pegasus_jax.episode import Episode, drive, mean_cost, states
 from pegasus_jax.exports.asked import asking
 from pegasus_jax.exports.watchdog import Watchdog
 from pegasus_jax.exports.write import export
-from pegasus_jax.runs import restore, store
+from pegasus_jax.runs import driven, restore, store
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.task import Task
 from pegasus_jax.types import Trajectory
 
 SLACK = 0.1  # of a period, by which a control may follow the one before it too late
-FOLDER = "driven"  # in a run's folder
 
 
 class Drive(NamedTuple):
@@ -35,6 +34,7 @@ class Drive(NamedTuple):
     episode: Episode
     period: float  # [s]
     times: np.ndarray  # [L] when each control was sent [s], from the first on
+    cost: float  # mean of a step, as of the run's own episodes
 
     @property
     def longest(self) -> float:
@@ -74,6 +74,7 @@ def drives(
     limit = max(0.5, 5 * task.dt) if watchdog is None else watchdog
     check_range("watchdog", limit, task.dt, open_low=True)
     task = task._replace(horizon=task.horizon if seconds is None else max(1, round(seconds / task.dt)))
+    print(restore.chosen(run, trial, int(state.trial)), file=sys.stderr)
     print(_announced(task, int(state.trial), limit), file=sys.stderr)
     with tempfile.TemporaryDirectory() as folder:
         control = runpy.run_path(str(export(run, int(state.trial), out=Path(folder) / "policy.py")))["Controller"]()
@@ -99,7 +100,7 @@ def _announced(task: Task, trial: int, limit: float) -> str:
 
 def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy: int, seed: int, limit: float) -> Drive:
     """One episode, logged. Raises RunError, or the signal, where it failed."""
-    log = run / FOLDER / f"{1 + max(store.numbered(run / FOLDER, '.npz'), default=0):04d}.npz"
+    log = driven.path_of(run, 1 + max(store.numbered(run / driven.FOLDER, ".npz"), default=0))
     times: list[float] = []
     rows: list[Any] = []
     act, memories = asking(control, task, seed)
@@ -110,7 +111,13 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
         cost = jax.vmap(task.cost.of_state)(states(task, ran.trajectory)[1:]) if drove else []
         cost = np.asarray(cost, np.float32)
         kept = ran._replace(trajectory=ran.trajectory._replace(cost=cost))  # type: ignore[arg-type]
-        done = Drive(log, kept, task.dt, np.array(times[: len(ran.trajectory.u)]) - (times[0] if times else 0))
+        done = Drive(
+            log,
+            kept,
+            task.dt,
+            np.array(times[: len(ran.trajectory.u)]) - (times[0] if times else 0),
+            mean_cost(kept, task) if drove else float("nan"),
+        )
         if len(done.times):
             _write(run, done, task, policy)
         return done

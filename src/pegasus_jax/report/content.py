@@ -12,13 +12,15 @@ import imageio.v3 as iio
 
 from pegasus_jax.checks import shown
 from pegasus_jax.config import label
-from pegasus_jax.report import read
+from pegasus_jax.episode import mean_cost
+from pegasus_jax.report import driven, read
 from pegasus_jax.report.curves import calibration, learning, trials
 from pegasus_jax.report.findings import findings, said
 from pegasus_jax.report.page import Section, data, downloads, facts, fold, table
 from pegasus_jax.report.read import Look
 from pegasus_jax.report.tables import trajectories_csv, trials_csv
 from pegasus_jax.report.trajectories import fans, summary
+from pegasus_jax.runs import store
 from pegasus_jax.runs.display import duration
 
 WIDTHS = ("policy.hidden", "policy.num_centers", "model.hidden")  # how large what was learned is
@@ -46,6 +48,7 @@ def sections(found: Look) -> list[Section]:
         Section("calibration", "Calibration", calibration(found)),
         Section("trials", "Trials", trials(found) if found.rows else NOTHING),
         Section("trajectories", "Real and imagined trajectories, controls", trajectories(found)),
+        Section("driven", "Episodes of pegasus-run", driven.section(found)),
         Section("film", "Film", film(found)),
         Section("policy", "Best policy", policy(found)),
         Section("settings", "Settings", settings(found)),
@@ -61,7 +64,7 @@ NOTHING = '<p class="soft">No trial is finished yet.</p>'
 def cards(found: Look) -> str:
     """The numbers that a person looks for first."""
     last = found.rows[-1] if found.rows else {}
-    spent = sum(sum((row.get("seconds") or {}).values()) for row in found.rows)
+    spent = sum(sum(store.computing(row)) for row in found.rows)
     pairs = [("trials done", f"{len(found.rows)} <small>of {found.config.trials}</small>")]
     if found.rows:
         pairs.append(("plant time", f"{last['plant_seconds']:g} s <small>trials of {period(found)}</small>"))
@@ -81,12 +84,17 @@ def best(found: Look) -> str:
     if found.best is None:
         return "not known"
     row = found.rows[found.best - 1] if found.best else {}
+    steps = [step.real for step in found.steps if step.real and step.policy == found.best]
+    own = [mean_cost(ran, found.task) for ran in steps if len(ran.trajectory.cost)]
+    ran = [one for one in found.driven if one.policy == found.best]
+    known = []
     if row.get("mean_cost") is not None:
-        how = f"success {row['success_rate']:.0%}, cost {row['mean_cost']:.3f} in its evaluation"
-    else:
-        own = [r["episode_cost"] for r in found.rows if r.get("policy") == found.best and r["episode_cost"] is not None]
-        how = f"cost {sum(own) / len(own):.3f} in {len(own)} of the episodes" if own else "not run yet"
-    return f"trial {found.best} <small>{how}</small>"
+        known.append(f"success {row['success_rate']:.0%}, cost {row['mean_cost']:.3f} in its evaluation")
+    elif own:
+        known.append(f"cost {sum(own) / len(own):.3f} in {len(own)} of the episodes")
+    if ran:
+        known.append(driven.worth(ran))
+    return f"trial {found.best} <small>{'; '.join(known) or 'not run yet'}</small>"
 
 
 def trajectories(found: Look) -> str:
@@ -95,7 +103,8 @@ def trajectories(found: Look) -> str:
     of_best = [step.number for step in found.steps if step.policy == (found.best or None)][:1]
     words = (
         "<p>Red is the episode on the plant. Blue is what the model imagined of it before: the bands hold 90 and 50 %"
-        " of the particles, the thin lines are some of them. The dotted lines are the limits of the controls.</p>"
+        " of the particles, the thin lines are some of them. The dotted lines are the limits of the controls."
+        " Particles that fly far away from the episode leave the picture.</p>"
     )
     folds = [
         fold(
@@ -143,8 +152,8 @@ def policy(found: Look) -> str:
     return (
         f"<p>The policy after {best(found).replace('<small>', '(').replace('</small>', ')')}. {escape(sizes)}. It"
         f" {escape(names)}, every {found.task.dt:g} s.</p>"
-        f"<pre>pegasus-eval {run} trial=best      # its cost and success in new episodes\n"
-        f"pegasus-play {run} trial=best      # a film\n"
+        f"<pre>pegasus-eval {run}                 # its cost and success in new episodes\n"
+        f"pegasus-play {run}                 # a film\n"
         f"pegasus-export {run}               # one file that needs no JAX</pre>"
     )
 

@@ -10,8 +10,8 @@ from pegasus_jax.report import read
 from pegasus_jax.report.chart import Level, Line, chart, unit
 from pegasus_jax.report.page import number, table
 from pegasus_jax.report.read import Look
+from pegasus_jax.runs import store
 from pegasus_jax.runs.display import executed
-from pegasus_jax.runs.store import SOLVED
 
 HEAD = (  # of the table of trials
     "trial",
@@ -34,7 +34,7 @@ def learning(found: Look) -> str:
     seconds = [row["plant_seconds"] for row in rows]
 
     def line(name: str, style: str, words: str) -> Line:
-        dots = [f"trial {row['trial']}: {number(row.get(name))}" for row in rows]
+        dots = [f"trial {row['trial']}: {number(row.get(name))}{early(row) * (name == 'episode_cost')}" for row in rows]
         return Line(seconds, [row.get(name) for row in rows], style, words, dots)
 
     costs = [
@@ -52,8 +52,13 @@ def learning(found: Look) -> str:
         if evaluated
         else Line(seconds, own, "real", "the trial's own episode: 1 succeeded, 0 did not", [f"{v}" for v in own])
     )
-    success = chart("Success", "plant time [s]", "success rate", [rate, Level(SOLVED, "90 %")], y=(-0.04, 1.04))
+    success = chart("Success", "plant time [s]", "success rate", [rate, Level(store.SOLVED, "90 %")], y=(-0.04, 1.04))
     return f"<p>Every trial raw: nothing is smoothed. A lower cost is better.</p>{cost}{success}"
+
+
+def early(row: dict[str, Any]) -> str:
+    """How an episode ended, where that was before its horizon."""
+    return "" if row.get("ended", "horizon") == "horizon" else f", {row['ended']}"
 
 
 def calibration(found: Look) -> str:
@@ -94,13 +99,12 @@ def trials(found: Look) -> str:
 
 def _row(row: dict[str, Any], best: bool, covered: dict[int, float | None]) -> list[str]:
     """The cells of a trial; it leads to its trajectories, where there are some."""
-    trial, seconds = row["trial"], row.get("seconds") or {}
-    compiling = seconds.get("compile", 0.0)
+    trial, (spent, compiling) = row["trial"], store.computing(row)
     name = f'<a href="#trial-{trial}">{trial}</a>' if trial in covered else str(trial)
     return [
         f"{name} <b>best</b>" if best else name,
         f"{row['plant_seconds']:g}",
-        escape(executed([row]).removeprefix("episode ").removeprefix("of ").removeprefix("by the ")),
+        escape(executed([row]).removeprefix("episode ").removeprefix("of ").removeprefix("by the ") + early(row)),
         number(row.get("episode_cost")),
         number(row.get("mean_cost")),
         number(row.get("success_rate"), ".0%"),
@@ -108,5 +112,5 @@ def _row(row: dict[str, Any], best: bool, covered: dict[int, float | None]) -> l
         number(row.get("calibration"), ".2f"),
         number(covered.get(trial), ".0%"),
         number(row.get("saturated"), ".0%"),
-        f"{sum(seconds.values()) - compiling:.0f} + {compiling:.0f}" if seconds else "–",
+        f"{spent:.0f} + {compiling:.0f}" if row.get("seconds") else "–",
     ]

@@ -58,7 +58,7 @@ def _model(found: Look) -> Iterator[Finding]:
         trial, ratio = known[-1]
         means = (
             "The model claims to know more than it does, so imagined costs are too good. This is usual in the first"
-            " trials. If it stays, give more trials, or choose another model."
+            " trials. If it stays after five, give more trials, then model=ensemble."
         )
         yield Finding("warning", f"trial {trial}: model errors {ratio:.1f} times as large as predicted", means)
     elif known and known[-1][1] < TOO_UNSURE:
@@ -102,7 +102,7 @@ def _policy(found: Look) -> Iterator[Finding]:
         )
     if found.best is not None and found.rows and 0 < found.best < len(found.rows):
         what = f"the best policy is of trial {found.best}, not of the last one"
-        yield Finding("note", what, "Use trial=best with pegasus-eval, pegasus-play and pegasus-export.")
+        yield Finding("note", what, "Every command takes the best one, unless trial= names another.")
     kept = [row.get("replaced") is False for row in found.rows[-LATEST:]]
     if len(kept) == LATEST and all(kept):
         means = "No search found a policy that is imagined to be better: the run has converged, or is stuck."

@@ -42,7 +42,7 @@ def _of_one(run: Path, done: int, trials: int) -> str:
 def _left(run: Path, done: int, trials: int) -> float | None:
     """Seconds until the last trial is done, from those before; None as long as none has shown it."""
     rows = store.readable_trials(run)[0][1:][-LATEST:]
-    took = [sum(v for k, v in (row.get("seconds") or {}).items() if k != "compile") for row in rows]
+    took = [sum(v for k, v in store.phases(row).items() if k != "compile") for row in rows]
     if not took:
         return None
     since = time.time() - (run / "trials.jsonl").stat().st_mtime

@@ -12,7 +12,7 @@ from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
 from pegasus_jax.episode import Episode
 from pegasus_jax.presets import own
-from pegasus_jax.runs import config_io, restore, store
+from pegasus_jax.runs import config_io, driven, restore, store
 from pegasus_jax.task import Task
 
 QUANTILES = (5, 25, 50, 75, 95)  # of the imagined particles [%]
@@ -38,6 +38,8 @@ class Look(NamedTuple):
     best: int | None  # the trial that learned the best policy; None where that is not known
     about: dict[str, Any]  # run.json
     problems: list[str]  # what could not be read
+    driven: list[driven.Driven]  # by pegasus-run, oldest first
+    fans: dict[int, dict[str, np.ndarray]]  # trial -> the particles of its policy
 
 
 def look(path: Path) -> Look:
@@ -53,7 +55,9 @@ def look(path: Path) -> Look:
             best = restore.best(path)
         except RunError as error:
             problems.append(str(error))
-    return Look(path, config, task, rows, [step for step in steps if step.real or step.fan], best, about, problems)
+    fans = {step.number - 1: step.fan for step in steps if step.fan is not None}
+    steps = [step for step in steps if step.real or step.fan]
+    return Look(path, config, task, rows, steps, best, about, problems, _driven(path, problems), fans)
 
 
 def _step(path: Path, number: int, problems: list[str]) -> Step:
@@ -68,6 +72,17 @@ def _step(path: Path, number: int, problems: list[str]) -> Step:
     except RunError as error:
         problems.append(str(error))
     return Step(number, None if origin is None else origin[0], real, fan)
+
+
+def _driven(path: Path, problems: list[str]) -> list[driven.Driven]:
+    """The logs of pegasus-run; what cannot be read is added to `problems`."""
+    logs = []
+    for number in store.numbered(path / driven.FOLDER, ".npz"):
+        try:
+            logs.append(driven.load(path, number))
+        except RunError as error:
+            problems.append(str(error))
+    return logs
 
 
 def names(task: Task) -> list[str]:

@@ -19,7 +19,7 @@ from pegasus_jax.report.progress import state
 from pegasus_jax.runs import groups
 
 HOST = "127.0.0.1"  # nobody else's machine
-WATCHED = ("config.yaml", "run.json", "trials.jsonl", "play.mp4", "episodes", "imagined")
+WATCHED = ("config.yaml", "run.json", "trials.jsonl", "play.mp4", "episodes", "imagined", "driven")
 
 # Asks once a second whether the page has changed, and if so puts the new one in its place: what was open stays open.
 SCRIPT = """

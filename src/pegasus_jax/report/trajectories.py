@@ -6,6 +6,8 @@ from html import escape
 
 import numpy as np
 
+from pegasus_jax.episode import mean_cost
+from pegasus_jax.math.window import window
 from pegasus_jax.report import read
 from pegasus_jax.report.chart import Band, Level, Line, Mark, chart, legend
 from pegasus_jax.report.read import Step
@@ -17,9 +19,9 @@ THIN = 12  # particles that are drawn as lines
 def summary(step: Step, task: Task, random: bool) -> str:
     """The line that opens a trial; `random` says of policy 0 that its controls were random."""
     if step.real is None:
-        return f'Trial {step.number} <span class="soft">imagined; the plant has not run this policy yet</span>'
+        return f'Trial {step.number} <span class="soft">imagined; no trial has run this policy yet</span>'
     who = f"policy of trial {step.policy}" if step.policy else "random controls" if random else "first policy"
-    cost = f"cost {np.mean(step.real.trajectory.cost):.3f}" if len(step.real.trajectory.cost) else "no control period"
+    cost = f"cost {mean_cost(step.real, task):.3f}" if len(step.real.trajectory.cost) else "no control period"
     share = read.coverage(step, task)
     inside = "nothing was imagined of it" if share is None else f"{share:.0%} of its states inside the 90 % band"
     early = "" if step.real.ended == "horizon" else f", ended early: {escape(step.real.ended)}"
@@ -30,16 +32,28 @@ def fans(step: Step, task: Task) -> str:
     """Charts of states, controls and cost."""
     states = len(task.state_names)
     every = [_marks(step, task, i, name) for i, name in enumerate(read.names(task))]
-    charts = [_one(name, marks) for name, marks in zip(read.names(task), every, strict=True)]
+    named = enumerate(zip(read.names(task), every, strict=True))
+    charts = [_one(name, marks, _limits(step, i, marks)) for i, (name, marks) in named]
     parts = {"States": charts[:states], "Controls and cost": charts[states:]}
     return legend(every[0]) + "".join(
         f'<h3>{title}</h3><div class="grid-of">{"".join(found)}</div>' for title, found in parts.items()
     )
 
 
-def _one(name: str, marks: list[Mark]) -> str:
+def _one(name: str, marks: list[Mark], limits: tuple[float, float] | None) -> str:
     words, _, unit = name.partition(" [")
-    return chart(words, "time [s]", name if unit else f"{name} a period" if name == "cost" else name, marks, small=True)
+    up = name if unit else f"{name} a period" if name == "cost" else name
+    return chart(words, "time [s]", up, marks, y=limits, small=True)
+
+
+def _limits(step: Step, i: int, marks: list[Mark]) -> tuple[float, float] | None:
+    """How far the chart of an entry reaches."""
+    real = None if step.real is None else read.real(step)[i]
+    return window(
+        real,
+        None if step.fan is None else read.imagined(step)[i],
+        *(mark.y for mark in marks if isinstance(mark, Level)),
+    )
 
 
 def _marks(step: Step, task: Task, i: int, name: str) -> list[Mark]:

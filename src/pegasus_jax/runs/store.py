@@ -22,6 +22,7 @@ Files appear whole or not at all: written beside their place, flushed to disk, t
 
 from __future__ import annotations
 
+import difflib
 import json
 import re
 import shutil
@@ -81,8 +82,9 @@ def _unused(path: Path) -> None:
 def existing(path: Path) -> Path:
     """The folder of a run. Raises RunError when there is none, or something in it is no file or no folder."""
     if not (path / "config.yaml").exists():
-        near = [p.parent for p in sorted(path.parent.glob("*/config.yaml"))] if path.parent.is_dir() else []
-        hint = f"; there are {', '.join(map(str, near[:5]))}" if near else ""
+        there = [str(p.parent) for p in sorted(path.parent.glob("*/config.yaml"))] if path.parent.is_dir() else []
+        near = difflib.get_close_matches(str(path), there, 5, cutoff=0.0)
+        hint = f"; there are {', '.join(near)}" if near else ""
         raise RunError(f"{path} is not a run (it has no config.yaml){hint}")
     for names, kind, right in ((FILES, "file", Path.is_file), (FOLDERS, "folder", Path.is_dir)):
         for name in names:
@@ -331,6 +333,19 @@ def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None =
     return min(own, key=lambda policy: (*np.mean(own[policy], 0), -policy))
 
 
+def phases(row: dict[str, Any]) -> dict[str, float]:
+    """The seconds of each phase of a trial, none twice: `between_episodes` is a waiting time, made of the others."""
+    known = row.get("seconds") or {}
+    return {name: spent for name, spent in known.items() if name != "between_episodes" and spent is not None}
+
+
+def computing(row: dict[str, Any]) -> tuple[float, float]:
+    """The seconds of a trial that went into computing, and into compiling: the episode is the plant's time."""
+    spent = phases(row)
+    compiling = spent.pop("compile", 0.0)
+    return sum(spent.values()) - spent.get("collect", 0.0), compiling
+
+
 def task_of(run: Path) -> Task:
     """The task of a run as its folder tells it: without a plant, and no code is imported for its cost."""
     return facts.to_task(stored(run)["task"], str(run / "run.json"))
@@ -353,7 +368,7 @@ def stored(run: Path) -> dict[str, Any]:
         raise RunError(
             f"{path} is damaged, or of pegasus-jax {version}, which noted no facts of its task: it cannot be read"
         )
-    return found
+    return found | {"task": facts.of_today(found["task"])}
 
 
 def note(run: Path, command: str, done: int, task: Task) -> None:

@@ -13,6 +13,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from pegasus_jax.checks import RunError
+from pegasus_jax.math.window import window
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.store import load_episode, load_imagined, trials
 from pegasus_jax.task import Task
@@ -53,24 +54,36 @@ def trial_pictures(run: Path, task: Task, trial: int) -> dict[str, Path]:
 def learning(rows: Sequence[dict[str, Any]], path: Path) -> None:
     """Cost and success against seconds of plant time, raw: no smoothing, no best so far.
 
-    Of a run that is not evaluated, the cost of each trial's own episode, by the policy of the trial before.
+    Of a run that is not evaluated, those of each trial's own episode, by the policy of the trial before. Episodes that
+    ended early have an empty circle.
     """
     measured = any(row["mean_cost"] is not None for row in rows)
-    cost, label = ("mean_cost", "mean of evaluation episodes") if measured else ("episode_cost", "the trial's episode")
-    seconds = [row["plant_seconds"] for row in rows]
+    cost, good = ("mean_cost", "success_rate") if measured else ("episode_cost", "episode_success")
+    early = [row for row in rows if row.get("ended", "horizon") != "horizon"]
+    hollow = dict(color=REAL, mfc="white", zorder=3)
     figure, (top, bottom) = plt.subplots(2, 1, sharex=True, figsize=(7, 5.5), height_ratios=(2, 1))
-    top.plot(seconds, [row[cost] for row in rows], "o-", color=REAL, label=f"plant, {label}")
-    top.plot(seconds, [row["objective_last"] for row in rows], ".--", color=IMAGINED, label="imagined, held scenarios")
-    top.plot(seconds, [row["objective_fresh"] for row in rows], ".:", color=IMAGINED, label="imagined, fresh scenarios")
-    top.set(ylabel="mean cost a step", ylim=(0, 1.02))
+    label = "mean of evaluation episodes" if measured else "the trial's episode"
+    _line(top, rows, cost, "o-", color=REAL, label=f"plant, {label}")
+    _line(top, rows, "objective_last", ".--", color=IMAGINED, label="imagined, held scenarios")
+    _line(top, rows, "objective_fresh", ".:", color=IMAGINED, label="imagined, fresh scenarios")
+    if early:
+        _line(top, early, "episode_cost", "o", label="plant, an episode that ended early", **hollow)
+    top.set(ylabel="mean cost a step", ylim=(0, max(1.02, *(1.04 * (row[cost] or 0) for row in rows))))
     top.legend(frameon=False)
-    bottom.plot(seconds, [row["success_rate"] for row in rows], "o-", color=REAL)
+    _line(bottom, rows, good, "o-", color=REAL)
+    bottom.set(ylabel="success rate", xlabel="plant time [s]", ylim=(-0.06, 1.06))
     if not measured:
-        bottom.text(0.5, 0.5, "not measured: eval_episodes=0", transform=bottom.transAxes, ha="center", va="center")
-    bottom.set(ylabel="success rate", xlabel="plant time [s]", ylim=(-0.03, 1.03))
+        _line(bottom, early, good, "o", **hollow)
+        bottom.set_ylabel("episode succeeded")
+        bottom.set_yticks([0, 1], ["no", "yes"])
     for axis in (top, bottom):
         axis.grid(alpha=0.25)
     _save(figure, path)
+
+
+def _line(axis: Axes, rows: Sequence[dict[str, Any]], name: str, style: str, **how: Any) -> None:
+    """Draw a number of the rows; where a row lacks it, there is a gap."""
+    axis.plot([row["plant_seconds"] for row in rows], np.array([row.get(name) for row in rows], float), style, **how)
 
 
 def trajectories(run: Path, trial: int, fan: dict[str, np.ndarray], task: Task, path: Path) -> None:
@@ -85,13 +98,15 @@ def trajectories(run: Path, trial: int, fan: dict[str, np.ndarray], task: Task, 
     for i, (axis, name) in enumerate(zip(flat, names, strict=False)):
         first = 1 if name == "cost" else 0
         _fan(axis, (first + np.arange(imagined[i].shape[0])) * task.dt, imagined[i])
+        if limits := window(None if actual is None else actual[i], imagined[i]):
+            axis.set_ylim(*limits)
         if actual is not None:
             axis.plot((first + np.arange(len(actual[i]))) * task.dt, actual[i], color=REAL, lw=1.6)
         axis.set_title(name, fontsize=9)
         axis.grid(alpha=0.25)
     for axis in flat[len(names) :]:
         axis.axis("off")
-    told = "the plant's next episode in red" if actual is not None else "the plant has not run this policy yet"
+    told = "the plant's next episode in red" if actual is not None else "no trial has run this policy yet"
     figure.suptitle(f"after trial {trial}: imagined particles in blue, {told}", fontsize=10)
     _save(figure, path)
 
