@@ -11,7 +11,7 @@ def window(real: np.ndarray | None, particles: np.ndarray | None, *levels: float
     """Limits of an axis for an episode [L], particles [H, K] and levels; None where none of these is a finite number.
 
     The whole episode is inside. So are the central particles of each period, unless they fly so far away that the
-    episode would be a flat line. Of an episode in which nothing moves, the height is that of the particles at its start.
+    episode would be a flat line. Of an episode in which nothing moves, the height is that of the first particles.
     """
     rows = _finite(real)
     low, high, central = _quantiles(particles)

@@ -108,7 +108,7 @@ def _row(row: dict[str, Any], best: bool, covered: dict[int, float | None]) -> l
         number(row.get("episode_cost")),
         number(row.get("mean_cost")),
         number(row.get("success_rate"), ".0%"),
-        number(row.get("objective_last")),
+        number(row.get("objective_fresh")),
         number(row.get("calibration"), ".2f"),
         number(covered.get(trial), ".0%"),
         number(row.get("saturated"), ".0%"),
