@@ -142,6 +142,7 @@ def test_the_last_episode_counts_though_it_has_no_row(run: Path) -> None:
     good = cheap.trajectory._replace(cost=0.01 * cheap.trajectory.cost)
     store.save_episode(run, 4, good, task, policy=3, ended="horizon")
     assert restore.best(run) == 3
+    assert restore.chosen(run, "best", 3) == f"best policy: trial 3 (cost {good.cost.mean():.3f} in 1 of the episodes)"
     store.save_episode(run, 4, good, task, policy=3, ended="error")
     assert restore.best(run) == 2
     # One that ended early pays for what it left out.

@@ -80,26 +80,30 @@ def best(run: Path) -> int:
         raise RunError(f"{run / 'trials.jsonl'} holds no finished trial yet")
     if len(rows) > 1 and len(rows) not in there and len(rows) - 1 in there:  # its checkpoint is being written
         rows.pop()
-    following = len(rows) + 1
-    ran, origin = store.load_episode(run, following), store.origin(run, following)
-    last = None
-    if ran is not None and origin is not None and len(ran.trajectory.u) and np.isfinite(ran.trajectory.cost).all():
-        last = {
-            "policy": origin[0],
-            "random": rows[-1]["random"],
-            "ended": ran.ended,
-            **verdict(ran, store.task_of(run)),
-        }
+    last = _episode_after(run, rows)
     try:
         return store.best_trial(rows, last, first=0 if 0 in there else 1)
     except (KeyError, TypeError) as error:
         raise RunError(f"{run / 'trials.jsonl'} has rows that this version cannot judge") from error
 
 
+def _episode_after(run: Path, rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
+    """What a row would say of the episode that has none yet; None without one."""
+    following = len(rows) + 1
+    ran, origin = store.load_episode(run, following), store.origin(run, following)
+    if ran is None or origin is None or not len(ran.trajectory.u) or not np.isfinite(ran.trajectory.cost).all():
+        return None
+    learned = {"objective_fresh": None, "mean_cost": None}
+    told = {"policy": origin[0], "random": rows[-1]["random"], "ended": ran.ended}
+    return learned | told | verdict(ran, store.task_of(run))
+
+
 def chosen(run: Path, trial: Trial, number: int) -> str:
     """Which policy a command uses that was asked for `trial`, and why, in one line; `number` is its trial."""
     if trial == BEST:
-        return best_line(store.trials(run), number)
+        rows = store.trials(run)
+        last = _episode_after(run, rows)
+        return best_line([*rows, *([last] if last else [])], number)
     return f"newest policy: trial {number}" if trial == LAST else f"policy of trial {number}, as asked"
 
 
