@@ -15,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # Folders end in a dot. What one layer holds side by side does not import each other.
 LAYERS = {
-    0: "types checks interrupt",
+    0: "types checks interrupt shell",
     1: "config_models shapes sharding task vectorized math.",
     2: "config_plant config_policies memory",
     3: "config models. imagine. episode",

@@ -7,14 +7,18 @@ import enum
 import os
 import runpy
 import signal
+import socket
+import subprocess
 import sys
-from pathlib import Path
+import types
+from pathlib import Path, PureWindowsPath
 
 import pytest
 
-from pegasus_jax import interrupt
+from pegasus_jax import interrupt, shell
 from pegasus_jax.checks import names_code
-from pegasus_jax.runs import cache, files, machine
+from pegasus_jax.report import serve
+from pegasus_jax.runs import cache, checkpoint, files, groups, machine
 from pegasus_jax.tasks.guide import is_folder
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -85,8 +89,83 @@ def test_files_are_written_where_no_folder_can_be_opened(tmp_path: Path, monkeyp
     assert [path.name for path in (tmp_path / "inner").iterdir()] == ["a.json"]
 
 
+def test_a_file_that_another_program_reads_is_replaced_a_moment_later(tmp_path: Path, monkeypatch) -> None:
+    """Windows refuses it for so long; elsewhere a refusal is one."""
+    usual, refusals = os.replace, [1]
+
+    def refusing(new: Path, path: Path) -> None:
+        if refusals:
+            refusals.pop()
+            raise PermissionError(13, "Access is denied", str(new))
+        usual(new, path)
+
+    monkeypatch.setattr(os, "replace", refusing)
+    monkeypatch.setattr(sys, "platform", "linux")
+    with pytest.raises(PermissionError):
+        files.write_json(tmp_path / "a.json", 1)
+    monkeypatch.setattr(sys, "platform", "win32")
+    refusals += [1, 2]
+    files.write_json(tmp_path / "a.json", 1)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.json"]
+    refusals.append(1)
+    with pytest.raises(PermissionError):
+        files.take_place(tmp_path / "a.json", tmp_path / "b.json", seconds=-1)
+
+
+@pytest.mark.parametrize("system", ["macOS", "Linux", "Windows"])
+def test_a_file_is_on_the_disk_in_the_way_of_its_system(system: str, tmp_path: Path, monkeypatch) -> None:
+    called: list[str] = []
+    fcntl = types.SimpleNamespace(fcntl=lambda handle, command: called.append(command))
+    if system == "macOS":
+        fcntl.F_FULLFSYNC = "F_FULLFSYNC"
+    monkeypatch.setitem(sys.modules, "fcntl", None if system == "Windows" else fcntl)
+    monkeypatch.setattr(os, "fsync", lambda handle: called.append("fsync"))
+    files.write_json(tmp_path / "a.json", 1)
+    assert called[0] == ("F_FULLFSYNC" if system == "macOS" else "fsync")
+
+
+def test_a_checkpoint_of_windows_is_whole_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    path = PureWindowsPath(r"C:\runs\demo\checkpoints\0001")
+    monkeypatch.setattr(checkpoint, "_files", lambda path: [path / "d" / "manifest.ocdbt"])
+    monkeypatch.setattr(checkpoint, "_digest", lambda file: "sum")
+    assert checkpoint._summed(path) == {"d/manifest.ocdbt": "sum"}
+
+
+def test_runs_on_two_drives_keep_their_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    def windows(paths: list[Path]) -> str:
+        raise ValueError("Paths don't have the same drive")
+
+    monkeypatch.setattr(os.path, "commonpath", windows)
+    runs = [[types.SimpleNamespace(path=Path(f"/{drive}/demo"))] for drive in "cd"]
+    assert [Path(name).parts[-2:] for name in groups._folders(runs)] == [("c", "demo"), ("d", "demo")]
+
+
+def test_commands_are_written_as_a_shell_of_the_system_reads_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    words = ["pegasus-train", r"resume=my runs\arm", "policy.hidden=[50,50]", r"out=runs\arm"]
+    assert shell.split(shell.typed(words)) == words
+    monkeypatch.setattr(sys, "platform", "win32")
+    assert shell.typed(words) == r'pegasus-train "resume=my runs\arm" "policy.hidden=[50,50]" out=runs\arm'
+    assert shell.split(shell.typed(words)) == words
+
+
+def test_two_programs_do_not_serve_at_one_port(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for system, shared in (("linux", True), ("win32", False)):  # there the option means another thing
+        monkeypatch.setattr(sys, "platform", system)
+        with serve.server([tmp_path], 0) as server:
+            assert bool(server.socket.getsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR)) == shared
+
+
+def test_letters_that_an_output_lacks_are_written_by_their_number() -> None:
+    code = (
+        "import sys; from pegasus_jax.cli.main import main; sys.argv = ['x', 'y']; main(lambda words: print('θ'), '')"
+    )
+    environment = {**os.environ, "PYTHONUTF8": "0", "PYTHONIOENCODING": "cp1252"}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment)
+    assert (done.returncode, done.stdout) == (0, "\\u03b8\n"), done.stderr
+
+
 def test_compiled_programs_are_kept_where_users_have_no_number(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delattr(os, "getuid")
+    monkeypatch.delattr(os, "getuid", raising=False)
     monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     monkeypatch.setenv("LOCALAPPDATA", str(tmp_path))
     folder = cache.folder()
@@ -112,7 +191,7 @@ def test_signals_are_those_that_the_system_has(monkeypatch: pytest.MonkeyPatch) 
     assert [one.name for one in found] == ["SIGINT", "SIGTERM", "SIGBREAK"]
     heard: list[int] = []
     before = signal.signal(signal.SIGINT, lambda number, frame: heard.append(number))
-    monkeypatch.delattr(signal, "pthread_kill")
+    monkeypatch.delattr(signal, "pthread_kill", raising=False)
     try:
         interrupt.to_main_thread(signal.SIGINT)
     finally:

@@ -1,8 +1,8 @@
 """The commands pegasus-train, -check, -eval, -plot and -play: `key=value` words in, an exit status out."""
 
 import gc
+import io
 import os
-import shlex
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,6 +13,7 @@ from pegasus_jax.cli import help, runs, version
 from pegasus_jax.cli import train as cli_train
 from pegasus_jax.runs import cache, files
 from pegasus_jax.runs.removed import renamed
+from pegasus_jax.shell import split
 
 Always = Callable[[], Sequence[str]]
 
@@ -62,6 +63,7 @@ def main(
     # What JAX makes when it traces stays: to look for garbage in it so often took a tenth of a short run's time.
     gc.set_threshold(100_000)
     words = sys.argv[1:]
+    _write_what_can_be()
     interrupt.before_end(_let_robots_go)
     try:
         interrupt.listen()
@@ -74,6 +76,12 @@ def main(
         code = interrupt.status()
     interrupt.clean_up()
     interrupt.end(code)
+
+
+def _write_what_can_be() -> None:
+    """A letter that the output has no code for, as pipes of Windows for Greek ones, is no error: \\u03b8 is written."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 def _stopped(home: Path) -> str:
@@ -132,7 +140,7 @@ def _always() -> list[str]:
     """The words of PEGASUS_SETTINGS, which come after those that were typed."""
     text = os.environ.get("PEGASUS_SETTINGS", "")
     try:
-        return shlex.split(text)
+        return split(text)
     except ValueError as error:
         raise ConfigError(f"PEGASUS_SETTINGS={text} cannot be read: {error}; expected key=value words") from error
 

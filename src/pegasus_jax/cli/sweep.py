@@ -4,7 +4,6 @@ import itertools
 import math
 import os
 import re
-import shlex
 import sys
 import time
 from collections import Counter
@@ -16,6 +15,7 @@ from typing import Any, NamedTuple
 from pegasus_jax.checks import ConfigError, did_you_mean, whole
 from pegasus_jax.cli.main import main
 from pegasus_jax.cli.words import MORE
+from pegasus_jax.shell import typed
 
 SWEEP = """\
 pegasus-sweep task=NAME [setting=value,value,... ...]     learn with every combination of the values
@@ -122,7 +122,7 @@ def show(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) 
     """Print the commands."""
     del at_once, out, options
     for job in jobs:
-        print(shlex.join(["pegasus-train", *job.words]))
+        print(typed(["pegasus-train", *job.words]))
 
 
 def local(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) -> None:

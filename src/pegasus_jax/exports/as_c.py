@@ -2,7 +2,6 @@
 
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import tempfile
@@ -14,6 +13,7 @@ import numpy as np
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Limit, Recall, Squash, Standardize, layers_of
 from pegasus_jax.exports.learned import Learned, said
+from pegasus_jax.shell import split
 
 HEADER = """\
 /* {title}, as written by pegasus-export.
@@ -240,7 +240,7 @@ def _table(name: str, array: np.ndarray) -> str:
 
 def compiler() -> list[str]:
     """The command of a C compiler: $CC, or the first of cc, gcc and clang. Raises ConfigError without one."""
-    found = shlex.split(os.environ.get("CC", "")) or [*filter(shutil.which, COMPILERS)][:1]
+    found = split(os.environ.get("CC", "")) or [*filter(shutil.which, COMPILERS)][:1]
     if not found or not shutil.which(found[0]):
         raise ConfigError(
             "format=c needs a C compiler to compare the header with the policy, and there is no cc, gcc or clang here"

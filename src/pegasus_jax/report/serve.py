@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import sys
 import threading
 from collections.abc import Sequence
 from hashlib import sha256
@@ -120,6 +121,7 @@ def server(paths: Sequence[Path], port: int) -> ThreadingHTTPServer:
             """Say nothing: a terminal is for what the person should know."""
 
     ThreadingHTTPServer.daemon_threads = True
+    ThreadingHTTPServer.allow_reuse_address = sys.platform != "win32"  # there it lets two programs have one port
     try:
         return ThreadingHTTPServer((HOST, port), Handler)
     except OSError as error:

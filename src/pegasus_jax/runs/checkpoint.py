@@ -35,7 +35,7 @@ def save(run: Path, trial: int, state: RunState) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     with _refused(path), _checkpointer() as checkpointer:
         checkpointer.save(path.absolute(), leaves)
-    write_json(_sums(run, trial), {str(f.relative_to(path)): _digest(f) for f in _files(path)})
+    write_json(_sums(run, trial), _summed(path))
 
 
 def available(run: Path) -> list[int]:
@@ -194,6 +194,11 @@ def _folder(run: Path, trial: int) -> Path:
 
 def _sums(run: Path, trial: int) -> Path:
     return run / "checkpoints" / f"{trial:04d}.json"
+
+
+def _summed(path: Path) -> dict[str, str]:
+    """The sum of each file in a folder, by its name there, which is the same on every system."""
+    return {file.relative_to(path).as_posix(): _digest(file) for file in _files(path)}
 
 
 def _files(path: Path) -> Iterator[Path]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import sys
 import threading
 import time
@@ -18,6 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 
 from pegasus_jax.config import Config, label
 from pegasus_jax.runs.trials_table import BLOCKS, PLAIN, best, count_solved, curves, solved, table
+from pegasus_jax.shell import typed
 
 # A phase, and what it is called. A trial that begins with `read` finds its episode on disk, for example after a kill.
 PHASES = {
@@ -225,7 +225,7 @@ def stopped(home: Path) -> str:
     """What a person who has stopped a run can do next."""
     if not (home / "config.yaml").exists() and not any(home.glob("seed*/config.yaml")):
         return f"stopped before anything was written to {home}; the same command begins again"
-    return f"stopped; every finished episode is kept, pegasus-train resume={shlex.quote(str(home))} goes on"
+    return f"stopped; every finished episode is kept, {typed(['pegasus-train', f'resume={home}'])} goes on"
 
 
 def summary(rows: Sequence[dict[str, Any]], trials: int, best: int | None = None) -> str:

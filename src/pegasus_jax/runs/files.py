@@ -4,6 +4,8 @@ import json
 import math
 import os
 import secrets
+import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -26,14 +28,41 @@ def write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:
         with os.fdopen(handle, "wb") as file:
             write(file)
             file.flush()
-            os.fsync(file.fileno())
-        os.replace(temporary, path)
+            _to_disk(file.fileno())
+        take_place(temporary, path)
     except BaseException as error:
         temporary.unlink(missing_ok=True)
         if isinstance(error, OSError) and error.filename is None:  # such as a full disk
             raise OSError(error.errno, error.strerror, str(path)) from error
         raise
     _flush(path.parent)
+
+
+def take_place(new: Path, path: Path, seconds: float = 2.0) -> None:
+    """Rename a file over another one.
+
+    Windows refuses that while somebody reads the other one, as pegasus-watch does for a moment: it is tried again for
+    so many seconds.
+    """
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            os.replace(new, path)
+            return
+        except PermissionError:
+            if sys.platform != "win32" or time.monotonic() > end:
+                raise
+            time.sleep(0.02)
+
+
+def _to_disk(handle: int) -> None:
+    """Let a file survive a power cut; fsync of macOS leaves it in the memory of the disk."""
+    try:
+        import fcntl
+
+        fcntl.fcntl(handle, fcntl.F_FULLFSYNC)  # pyright: ignore[reportAttributeAccessIssue]
+    except (ImportError, AttributeError, OSError):  # another system, or a file system without it
+        os.fsync(handle)
 
 
 def _flush(folder: Path) -> None:

@@ -146,7 +146,10 @@ def _labels(groups: list[list[Run]]) -> list[str]:
 def _folders(groups: list[list[Run]]) -> list[str]:
     """The first folder of each group, without what all share and without its seed."""
     paths = [group[0].path.resolve() for group in groups]
-    top = Path(os.path.commonpath([path.parent for path in paths]))
+    try:
+        top = Path(os.path.commonpath([path.parent for path in paths]))
+    except ValueError:  # two drives of Windows have nothing in common
+        return [path.as_posix() for path in paths]
     names = [re.sub(r"[-_/]?seed\d+$", "", path.relative_to(top).as_posix()) or path.name for path in paths]
     unique = len({*names}) == len(names)
     return names if unique else [path.relative_to(top).as_posix() for path in paths]

@@ -25,6 +25,7 @@ from pegasus_jax.checks import RunError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import restore
 from pegasus_jax.runs.collect import failed
+from pegasus_jax.runs.files import take_place
 from pegasus_jax.task import Task
 from pegasus_jax.types import Array, Key, Params, Policy, Trajectory
 
@@ -75,7 +76,7 @@ def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.BES
             tasks.close(task)
             if writer is not None:
                 writer.close()
-        os.replace(beside, path)
+        take_place(beside, path)
     return path
 
 
