@@ -66,6 +66,12 @@ def test_completion_knows_every_command() -> None:
     assert {*completion.commands()} == {*scripts} - {"pegasus-figures", "pegasus-completion"}
 
 
+def runs_here(shell: str, command: str = "true") -> bool:
+    """Whether a shell is here and a command succeeds in it: the bash of Windows is that of another system, or none."""
+    found = os.name == "posix" and shutil.which(shell)
+    return bool(found) and subprocess.run([found, "-c", command], capture_output=True).returncode == 0
+
+
 PERIODS = [f"{name}=" for name in config_io.leaves(Config().search.period, "search.period.")]
 # What is typed, and what completes it; a folder `demo folder` and a file `arm.xml` are there.
 TYPED = [
@@ -91,7 +97,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.skipif(not shutil.which("bash"), reason="no bash")
+@pytest.mark.skipif(not runs_here("bash", "((BASH_VERSINFO[0] > 3))"), reason="no bash, or the bash 3 of macOS")
 def test_bash_completes(folder: Path) -> None:
     ask = """line="$1"; COMP_LINE="$line" COMP_POINT=${#line} COMP_WORDBREAKS=$' =:'; _pegasus "${line%% *}"
              printf '%s\\n' "${COMPREPLY[@]}" """
@@ -102,7 +108,7 @@ def test_bash_completes(folder: Path) -> None:
         assert sorted(filter(None, done.stdout.split("\n"))) == sorted(expected), typed
 
 
-@pytest.mark.skipif(not shutil.which("fish"), reason="no fish")
+@pytest.mark.skipif(not runs_here("fish"), reason="no fish")
 def test_fish_completes(folder: Path) -> None:
     for typed, expected in TYPED:
         script = f"source words.fish; complete -C '{typed}'"
@@ -113,7 +119,7 @@ def test_fish_completes(folder: Path) -> None:
         assert sorted(found) == sorted(f"{key[0]}={word}" if key[1] else word for word in expected), typed
 
 
-@pytest.mark.skipif(not shutil.which("zsh"), reason="no zsh")
+@pytest.mark.skipif(not runs_here("zsh"), reason="no zsh")
 def test_zsh_completes(folder: Path) -> None:
     """At a terminal: a word is typed, then a tabulator, and the line is what zsh makes of it."""
     start = "PS1='> '; autoload -Uz compinit; compinit -D; source ./words.zsh; echo rea'dy'\n"

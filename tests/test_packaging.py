@@ -194,6 +194,24 @@ def test_a_workflow_has_its_form_and_runs_what_there_is(name: str) -> None:
     assert all((ROOT / path).is_file() for path in tests)
 
 
+FORMS = {
+    "github-workflows": "workflows/*.yml",
+    "github-issue-forms": "ISSUE_TEMPLATE/[!c]*.yml",
+    "github-issue-config": "ISSUE_TEMPLATE/config.yml",
+    "citation-file-format": "../CITATION.cff",
+}
+
+
+@pytest.mark.parametrize("schema", FORMS)
+def test_what_github_reads_has_the_published_form(schema: str) -> None:
+    """The schemas come with the package: no network."""
+    paths = [str(path) for path in (ROOT / ".github").glob(FORMS[schema])]
+    words = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", f"vendor.{schema}", *paths]
+    done = subprocess.run(words, capture_output=True, text=True)
+    assert paths
+    assert done.returncode == 0, done.stdout
+
+
 def test_ci_has_three_pythons_and_three_systems_and_a_tag_releases() -> None:
     ci, release = workflow("ci"), workflow("release")
     matrix = ci["jobs"]["installed"]["strategy"]["matrix"]
