@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 
 _ADVICE = (
-    "Cannot draw: no way of drawing without a display works here. Install EGL or OSMesa, for example "
-    "`apt-get install libegl1 libgl1-mesa-dri` or `apt-get install libosmesa6`, or set MUJOCO_GL to one that works."
+    "Cannot draw: no way of drawing without a display works here. Install EGL or OSMesa, for example `apt-get "
+    "install libegl1 libopengl0 libgl1-mesa-dri` or `apt-get install libosmesa6`, or set MUJOCO_GL to one that works."
 )
 
 
