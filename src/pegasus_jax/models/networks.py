@@ -10,10 +10,27 @@ import jax.numpy as jnp
 
 from pegasus_jax.types import Array, Dropout, Key, Params, Prediction
 
-INITIALIZERS: dict[str, Callable] = {
-    "glorot": nn.initializers.glorot_normal(),
-    "orthogonal": nn.initializers.orthogonal(),
-}
+
+def orthogonal(key: Key, shape: tuple[int, int], dtype: Any = jnp.float32) -> Array:
+    """A matrix with orthonormal columns, or rows where there are fewer of these, uniformly distributed.
+
+    That of jax.nn.initializers.orthogonal up to rounding, by Gram-Schmidt, twice for each column. In JAX 0.10 LAPACK's
+    QR of a batch waits for threads that wait themselves, for ever where a CPU has two (as in jax-ml/jax#24219).
+    """
+    long, short = max(shape), min(shape)
+
+    def add(basis: Array, column: tuple[Array, Array]) -> tuple[Array, None]:
+        index, v = column
+        for _ in range(2):
+            v = v - basis @ (basis.T @ v)  # columns to come are zero
+        return basis.at[:, index].set(v / jnp.linalg.norm(v)), None
+
+    columns = jax.random.normal(key, (long, short), dtype).T
+    basis, _ = jax.lax.scan(add, jnp.zeros((long, short), dtype), (jnp.arange(short), columns))
+    return basis if shape[0] >= shape[1] else basis.T
+
+
+INITIALIZERS: dict[str, Callable] = {"glorot": nn.initializers.glorot_normal(), "orthogonal": orthogonal}
 
 
 @jax.custom_jvp
