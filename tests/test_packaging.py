@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -157,6 +158,19 @@ def learns(python: str, wheel: zipfile.ZipFile, folder: Path) -> None:
 @pytest.mark.slow
 def test_the_wheel_learns_in_an_empty_environment(wheel: zipfile.ZipFile, tmp_path: Path) -> None:
     learns(sys.executable, wheel, tmp_path)
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("words", ["uv tool run --from", "pipx run --spec"])
+def test_the_wheel_runs_without_being_installed(words: str, wheel: zipfile.ZipFile, tmp_path: Path) -> None:
+    program, *rest = words.split()
+    if not find_spec(program):
+        pytest.skip(f"no {program} is here")
+    alone = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "XLA_FLAGS"))}
+    command = [sys.executable, "-m", program, *rest, wheel.filename, "pegasus-train", "--version", "--verbose"]
+    done = subprocess.run([*map(str, command)], cwd=tmp_path, env=alone, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert re.search(r"^devices +cpu", done.stdout, re.MULTILINE)
 
 
 @pytest.mark.campaign
