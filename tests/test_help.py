@@ -122,7 +122,7 @@ def test_fish_completes(folder: Path) -> None:
 @pytest.mark.skipif(not runs_here("zsh"), reason="no zsh")
 def test_zsh_completes(folder: Path) -> None:
     """At a terminal: a word is typed, then a tabulator, and the line is what zsh makes of it."""
-    start = "PS1='> '; autoload -Uz compinit; compinit -D; source ./words.zsh; echo rea'dy'\n"
+    start = "PS1='> '; autoload -Uz compinit; compinit -u -D; source ./words.zsh; echo rea'dy'\n"
     import pty  # Windows has none, nor a zsh
 
     terminal, inside = pty.openpty()
