@@ -1,16 +1,20 @@
-"""The pictures of the documentation: every plant, and an episode of a run.
+"""The pictures and films of the documentation: every plant, and episodes of learned policies.
 
-    python -m benchmarks.pictures [run=runs/cartpole-seed0]
+    python -m benchmarks.pictures [cartpole=RUN] [double_cartpole=RUN] [swimmer=RUN]
     python -m benchmarks.pictures plants
 
-Writes docs/pictures/cartpoles.png and swimmer.png: every plant, at its start and at its goal. With a run also
-swingup.png: a learned episode, frame by frame. The curves of benchmarks/results are drawn by benchmarks.results_page.
+Writes docs/pictures/cartpoles.png and swimmer.png: every plant, at its start and at its goal. Of a plant whose run is
+there it writes also a film, cartpole.mp4 and so on, of one episode by the run's best policy; of the cart-pole
+swingup.png too, the episode frame by frame. What makes these runs is in RUNS; where there is none, the film stays, and
+the command is said. The curves of benchmarks/results are drawn by benchmarks.results_page.
 """
 
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import imageio.v2 as imageio
 import jax
 import jax.numpy as jnp
 import matplotlib
@@ -19,6 +23,7 @@ matplotlib.use("Agg")
 
 import matplotlib.pyplot as plt
 import numpy as np
+from PIL import Image
 
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
@@ -26,10 +31,22 @@ from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames
 from pegasus_envs.swimmer.goals import Task
 from pegasus_envs.swimmer.plant import swimmer
-from pegasus_jax.runs import config_io
-from pegasus_jax.runs.restore import ready
+from pegasus_jax.runs import config_io, store
+from pegasus_jax.runs.restore import BEST, best, ready
+from pegasus_jax.viz import video
 
 PICTURES = Path(__file__).parents[1] / "docs" / "pictures"
+# The words of pegasus-train after which a run's best policy is filmed, and the key of the episode.
+RUNS = {
+    "cartpole": ("task=cartpole trials=5", 1),
+    "double_cartpole": (
+        "task=double_cartpole search.steps=604 search.warm_restart=0 search.warm_limit_factor=1 seed=4 trials=21",
+        4,  # one that succeeds: not half of them do
+    ),
+    "swimmer": ("task=swimmer_knife_edge seed=27 trials=8", 1),
+}
+SMALLER = 2  # times, than the films of pegasus-play
+SMALL = ["-crf", "33", "-preset", "veryslow", "-movflags", "+faststart"]  # of ffmpeg: a page waits for no film
 
 
 def poses() -> dict[str, list[tuple[str, Plant, Any]]]:
@@ -74,8 +91,8 @@ def plants() -> None:
 
 
 def swing_up(run: Path, path: Path, shown: int = 9) -> None:
-    """Frames of one evaluation episode of a run's newest policy, side by side."""
-    _, experiment, state = ready(run)
+    """Frames of one evaluation episode of a run's best policy, side by side."""
+    _, experiment, state = ready(run, BEST)
     episode = jax.jit(experiment.episode)(jax.random.key(1), state.policy.params, jnp.asarray(False))
     plant = experiment.task.plant
     times = np.linspace(0, experiment.task.horizon, shown).round().astype(int)
@@ -90,14 +107,42 @@ def swing_up(run: Path, path: Path, shown: int = 9) -> None:
     plt.close(figure)
 
 
+def film(run: Path, path: Path, key: int) -> None:
+    """A film of one episode of a run's best policy, in real time, with cost and command below."""
+    _, experiment, state = ready(run, BEST)
+    task = experiment.task
+    perform = jax.jit(partial(video.performance, task=task, policy=experiment.policy))
+    ran, states = perform(jax.random.key(key), state.policy.params)
+    whole = video.composed(video.pictures(task, states), video.strip(ran, task, f"{task.name}, trial {state.trial}"))
+    rate = round(len(whole) / (task.horizon * task.dt))
+    with imageio.get_writer(path, fps=rate, macro_block_size=16, output_params=SMALL) as writer:
+        for picture in whole:
+            writer.append_data(np.asarray(Image.fromarray(picture).reduce(SMALLER)))
+
+
+def of_run(name: str, run: Path) -> None:
+    """Film a run, and draw its swing-up; say how good what is filmed is."""
+    words, key = RUNS[name]
+    if not store.holds(run):
+        print(f"{name}.mp4 stays as it is: there is no {run}; pegasus-train {words} out={run} makes it")
+        return
+    film(run, PICTURES / f"{name}.mp4", key)
+    if name == "cartpole":
+        swing_up(run, PICTURES / "swingup.png")
+    row = store.trials(run)[best(run) - 1]
+    success, seconds = row["success_rate"], row["plant_seconds"]
+    print(f"{name}.mp4: after {seconds:g} s of plant time, {success:.0%} of 20 episodes succeed")
+
+
 def main(words: list[str]) -> None:
     """The command line of this module."""
     PICTURES.mkdir(parents=True, exist_ok=True)
     plants()
     if words == ["plants"]:
         return
-    options, _ = config_io.split(words, ("run",))
-    swing_up(Path(options.get("run", "runs/cartpole-seed0")), PICTURES / "swingup.png")
+    options, _ = config_io.split(words, tuple(RUNS))
+    for name in RUNS:
+        of_run(name, Path(options.get(name, f"runs/film-{name}")))
 
 
 if __name__ == "__main__":

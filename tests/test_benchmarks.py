@@ -10,14 +10,17 @@ import re
 import shlex
 from pathlib import Path
 
+import imageio.v2 as imageio
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import RESULTS, readme_table, results_page
+from benchmarks import RESULTS, pictures, readme_table, results_page
 from benchmarks.speed import compare, scaling, timing
 from benchmarks.speed.workloads import SIZES, flop, products, workload
+from pegasus_jax import tasks
+from pegasus_jax.cli.train import understood
 from pegasus_jax.runs import config_io, machine
 
 TINY = {
@@ -230,3 +233,14 @@ def test_a_setting_is_a_word_of_the_command_line():
     values = {"false": False, "null": None, "1": 1.0, "0.001": 1e-3, "[1,2.5]": (1, 2.5), "sine": "sine"}
     assert [readme_table.word(value) for value in values.values()] == list(values)
     assert readme_table.spans([0, 1, 2, 5, 9, 10]) == "0-2, 5, 9-10"
+
+
+@pytest.mark.parametrize("name", pictures.RUNS)
+def test_each_plant_has_a_small_film_whose_run_can_be_made_again(name: str) -> None:
+    words, _ = pictures.RUNS[name]
+    task = tasks.of_config(understood(words.split())[0].config)
+    film = pictures.PICTURES / f"{name}.mp4"
+    assert film.stat().st_size <= 60 * 1024
+    with imageio.get_reader(film) as reader:
+        assert reader.get_meta_data()["duration"] == pytest.approx(task.horizon * task.dt, abs=0.1)
+    assert f'<video src="pictures/{film.name}"' in (pictures.PICTURES.parent / "plants.md").read_text()
