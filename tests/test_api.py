@@ -1,6 +1,5 @@
 """The public names: each can be called with the others alone, and what a signature names is public too."""
 
-import dataclasses
 import inspect
 import itertools
 import re
@@ -146,9 +145,8 @@ def _() -> Any:
     fitted = pg.minibatches(DYNAMICS, optax.sgd(1e-3, momentum=0.9), batch_size=3)
     still = pg.PolicyOptimizer(init=lambda params: (), run=lambda key, learner, *_, **__: (learner, "searched"))
     twice = pg.Cost(lambda x: 2 * jnp.sum(x**2))
-    config = dataclasses.replace(CONFIG, search=dataclasses.replace(CONFIG.search, cost_width_start=1.0))
     own: dict[str, Any] = dict(dynamics=DYNAMICS, policy=POLICY, fitter=fitted, searcher=still, cost=twice)
-    experiment = pg.compose(config, TASK, **own)
+    experiment = pg.compose(CONFIG, TASK, **own)
     state = experiment.init(key())
     assert jax.tree.structure(state.model.optimizer) == jax.tree.structure(fitted.init(state.model.params))
     state = experiment.add_episode(state, experiment.collect(state))
@@ -300,9 +298,8 @@ def _() -> Any:
 @example(*(f"costs.{name}" for name in pg.costs.__all__))
 def _() -> Any:
     cost = pg.costs.saturating(error, 1.0, ())
-    assert cost.widen is not None
     x = jax.random.normal(key(), (H, K, D))
-    each = pg.costs.of_particles(cost.widen(2.0))(x)
+    each = pg.costs.of_particles(pg.costs.widened(cost, 2.0))(x)
     stopped = pg.costs.until_stop(each, x, lambda x: x[0] > 1, 1.0)
     assert each.shape == stopped.shape == (H, K)
     assert pg.costs.of_matched(cost)(x).shape == pg.costs.of_narrow(cost, (0,))(x).shape == (H, 1)

@@ -215,11 +215,17 @@ def test_an_annealing_search_has_one_course():
         config.Search(anneal_trials=2, refine_fraction=0.5)
 
 
-def test_a_cost_without_a_width_cannot_be_widened():
-    task = cart(horizon=2)
-    task = task._replace(cost=task.cost._replace(widen=None))
-    with pytest.raises(ConfigError, match=r"search\.cost_width_start=4 needs a cost with a width.*the nearest is 1"):
-        compose(tiny(), task)
+@pytest.mark.parametrize("stop", [None, lambda x: jax.nn.sigmoid(9 * x[0])])
+def test_a_cost_that_is_only_a_function_is_widened_as_well(stop):
+    """Each particle's exactly, and their expectation by nodes; what an early end costs is not."""
+    task = cart(horizon=3)._replace(stop=stop, stop_cost=1.5)
+    x = 0.4 * jax.random.normal(jax.random.key(0), (3, 20, len(task.state_names)))
+    for of, near in (("particles", 1e-6), ("gaussian", 0.01)):
+        costs = (
+            costs_of(config.Search(cost_estimator=of), t) for t in (task, task._replace(cost=Cost(task.cost.of_state)))
+        )
+        known, own = (f(None, jnp.array(2.0))(x) for f in costs)
+        np.testing.assert_allclose(own, known, atol=near)
 
 
 def test_the_matched_cost_of_any_function_is_that_of_its_nodes():

@@ -159,7 +159,7 @@ def test_starts_that_hang_are_not_torn_at_the_seam() -> None:
 
 
 def learned(folder: Path, env: str, cost: str, **given: Any) -> Path:
-    config = tiny(trials=2, search__steps=5, search__cost_width_start=1.0, fit__steps=20, eval_episodes=2, **PLAIN)
+    config = tiny(trials=2, search__steps=5, fit__steps=20, eval_episodes=2, **PLAIN)
     config = replace(config, task="gym", env=env, cost=f"{__name__}:{cost}", horizon=6, **given)
     known = tasks.resolve(config)
     train(known, store.create(folder))

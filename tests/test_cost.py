@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from pegasus_envs.cartpole import cartpole
@@ -16,6 +16,7 @@ from pegasus_jax import tasks
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.math.angles import encode
 from pegasus_jax.math.gaussian import sincos
+from pegasus_jax.types import Cost
 
 COSTS = np.random.default_rng(0).uniform(size=(6, 4)).astype(np.float32)  # [H, K]
 number = st.floats(-5, 5, width=32)
@@ -166,6 +167,37 @@ def test_a_widened_cost_is_that_of_a_smaller_error(x64):
     np.testing.assert_allclose(of_state(3.0, x), third.of_state(x), rtol=1e-10)
     expected = third.expected(x, root @ root.T)
     np.testing.assert_allclose(of_gaussian(3.0, x, root @ root.T), expected, rtol=1e-10)
+
+
+def test_any_cost_is_widened_as_a_gaussian_one_is(x64):
+    """The closed form, its slope and nearly its expectation, of a cost of which only the values are known."""
+    known = cost.saturating(lambda x: jnp.array([x[0] - 0.3, 0.4 * x[1]]), 0.7, ())
+    own = Cost(known.of_state)
+    x, cov = 2 * np.random.default_rng(4).normal(size=(50, 2)), np.array([[0.5, 0.2], [0.2, 0.3]])
+
+    @jax.jit
+    def all_of(factor):
+        costs = cost.widened(known, factor), cost.widened(own, factor)
+        return [(jax.vmap(jax.value_and_grad(c.of_state))(x), cost.expectation(c)(x[0], cov)) for c in costs]
+
+    for factor in (1.0, 2.0, 8.0):
+        (closed, expected), (values, by_nodes) = all_of(factor)
+        jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-6, atol=1e-9), values, closed)
+        np.testing.assert_allclose(by_nodes, expected, atol=2e-3)
+
+
+@given(st.floats(-0.5, 1.5, width=32), st.floats(-0.5, 1.5, width=32), st.sampled_from([1.0, 2.0, 8.0]))
+@example(1.0, 0.0, 2.0)
+@example(1.0, float(np.nextafter(np.float32(1), np.float32(0))), 8.0)
+def test_a_widened_cost_keeps_the_order_and_has_a_slope(one, other, factor):
+    """Also at 0 and 1, beside them, and for a cost of 1 and more, which keeps its slope."""
+    wide = cost.widened(Cost(lambda x: x), factor).of_state
+    values, slopes = (jax.vmap(f)(jnp.array([one, other])) for f in (wide, jax.grad(wide)))
+    assert (one - other) * float(values[0] - values[1]) >= 0
+    assert np.all(np.isfinite(slopes) & (slopes > 0))
+    np.testing.assert_allclose(slopes[jnp.array([one, other]) >= 1], 1)
+    assert abs(float(wide(jnp.zeros(())))) < 1e-6
+    assert factor > 1 or np.allclose(values, [one, other], atol=1e-6)
 
 
 def test_the_matched_cost_is_that_of_the_particles_gaussian(x64):

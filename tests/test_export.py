@@ -56,7 +56,7 @@ def learned_by(home: Path, name: str) -> Path:
     """A run of a policy of POLICIES; of circles, with a task that has some."""
     changes: dict[str, Any] = {**POLICIES[name]}
     if "circles" in name:
-        changes |= {"made": round_arm(), "model": "log_normal", "search__cost_width_start": "1"}
+        changes |= {"made": round_arm(), "model": "log_normal"}
     with pytest.MonkeyPatch.context() as patch:
         if "policy" in changes:  # its own settings are not those of a network
             patch.setattr(folders, "TINY", {k: v for k, v in folders.TINY.items() if k != "policy.hidden"})

@@ -306,9 +306,7 @@ def test_an_environment_gets_rates_as_a_robot_computes_them():
     assert (task.state_names, task.rates) == (("x1", "rate of x1"), (1,))
     assert [*map(rate_of, ("x [m]", "swing [rad]"))] == ["rate of x [m/s]", "rate of swing [rad/s]"]
     np.testing.assert_array_equal(task.start_mean, [1, 0])
-    config = tiny(
-        sensors=config.sensors, search__steps=2, search__cost_width_start=1.0, fit__steps=2, trials=2, **PLAIN
-    )
+    config = tiny(sensors=config.sensors, search__steps=2, fit__steps=2, trials=2, **PLAIN)
     exp = compose(config, task)
     state = exp.init(jax.random.key(0))
     ran = exp.collect(state)

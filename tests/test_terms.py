@@ -102,9 +102,7 @@ def test_settings_that_cannot_be_are_one_line(words, said):
 @pytest.fixture(scope="module")
 def run():
     """An experiment whose cost takes everything, and an episode of it."""
-    config = parse(
-        task="cartpole", cost=price, reference=sine, goals=goals, **{"search.cost_width_start": "1"}, **SMALL
-    )
+    config = parse(task="cartpole", cost=price, reference=sine, goals=goals, **SMALL)
     exp = build(config)
     ran = jax.jit(exp.episode)(jax.random.key(2), jax.jit(exp.init)(jax.random.key(1)).policy.params, True)
     return exp, ran
@@ -174,9 +172,6 @@ def test_goals_of_episodes_differ_and_are_those_of_the_limits():
     assert drawn.shape == (30, 2)
     assert drawn.min(0)[0] < 1.3 < 2.7 < drawn.max(0)[0]
     assert np.all((drawn >= [1, 2]) & (drawn <= [3, 2.5]))
-
-
-ONE = SMALL | {"search.cost_width_start": "1"}
 
 
 def test_what_has_no_terms_is_as_it_was():
@@ -269,7 +264,7 @@ def test_starts_are_drawn_equally_likely_with_the_spread_of_the_task():
 
 def test_a_cost_is_checked_with_all_that_it_takes():
     def checked(cost):
-        config = parse(task="cartpole", cost=cost, **ONE)
+        config = parse(task="cartpole", cost=cost, **SMALL)
         return before_training(config, build(config).task)
 
     assert checked(lambda x, u: 1 - jnp.exp(-(x[0] ** 2) - u[0] ** 2 / 100)) == []
@@ -300,9 +295,9 @@ def test_a_folder_keeps_the_terms_the_reference_and_the_size_of_goals(run):
 @pytest.mark.slow
 def test_the_controller_is_given_goals_and_references(tmp_path):
     """Beside the policy itself, which is given by hand what the controller remembers."""
-    words = dict(cost=price, reference=sine, goals=goals, **ONE)
+    words = dict(cost=price, reference=sine, goals=goals, **SMALL)
     task = tasks.whole(tasks.of_config(parse(task="cartpole", **words)))
-    plain = {name.replace(".", "__"): value for name, value in ONE.items() if name not in ("model", "trials")}
+    plain = {name.replace(".", "__"): value for name, value in SMALL.items() if name not in ("model", "trials")}
     control = controller(a_run(tmp_path / "run", made=task, **plain), trial="last")
     _, experiment, state = restored(tmp_path / "run")
     x = np.array([0.1, -0.2, 0.3, 3.0])

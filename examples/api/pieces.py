@@ -14,7 +14,7 @@ import pegasus_jax as pg
 K, H, D, U = 20, 8, 4, 1  # particles, horizon, entries of the state and of the control
 key = jax.random.key(0)
 small = dict(model=pg.config.BNN(hidden=(16,)), policy=pg.config.MLP(hidden=(16,)), fit=pg.config.Fit(steps=10))
-searching = pg.config.Search(steps=4, particles=K, cost_width_start=1)
+searching = pg.config.Search(steps=4, particles=K)
 config = pg.Config("cartpole", trials=2, search=searching, **small)
 task = pg.tasks.make("cartpole")
 
@@ -81,6 +81,8 @@ cost = pg.Cost(lambda x: 1 - jnp.exp(-(x[0] ** 2)))
 assert cost.of_state(jnp.zeros(D)).shape == ()
 
 # costs
+wide = pg.costs.widened(cost, 2.0)  # felt from twice as far
+assert wide.of_state(x[-1]) < cost.of_state(x[-1])
 expected = pg.costs.expected_by_nodes(task.cost.of_state)  # of a Gaussian: mean [D], cov [D, D]
 assert jax.eval_shape(expected, jnp.zeros(D), jnp.eye(D)).shape == ()
 

@@ -57,7 +57,7 @@ def compose(
     `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
     There is room for `logged` rows of data besides those of the trials.
     With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
-    does not suit the config: a cost without a width, for example, needs `search.cost_width_start=1`.
+    does not suit the config: moment matching, for example, needs more particles than states.
     """
     task = remembering(config, task._replace(cost=as_cost(task.cost)))
     task = tasks.whole(task, None if cost is None else as_cost(cost))

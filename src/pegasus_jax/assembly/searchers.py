@@ -219,18 +219,10 @@ def analytic_search_of(
 
 
 def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Array | None], Callable[[Array], Array]]:
-    """(whether this refines, a factor of the cost's width; None: never) -> costs [H, K] or [H, 1] of states [H, K, D].
-
-    Raises ConfigError where the task's cost has no width.
-    """
-    if search.cost_width_start > 1 and task.cost.widen is None:
-        raise ConfigError(
-            f"search.cost_width_start={search.cost_width_start:g} needs a cost with a width,"
-            f" which that of task={task.name} lacks; the nearest is 1"
-        )
+    """(whether this refines, a factor of the cost's width; None: never) -> costs [H, K] or [H, 1] of x [H, K, D]."""
 
     def costs(refining: Array | None, width: Array | None) -> Callable[[Array], Array]:
-        now = task.cost if width is None or task.cost.widen is None else task.cost.widen(width)
+        now = task.cost if width is None else cost.widened(task.cost, width)
         if search.cost_estimator != "gaussian":
             return until_stop(task, cost.of_particles(now))
         matched = matching_of(search, task).cost(now, task.angles)

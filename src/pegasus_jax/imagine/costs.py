@@ -25,6 +25,7 @@ __all__ = [
     "saturating",
     "total",
     "until_stop",
+    "widened",
 ]
 
 OfState = Callable[[Array], Array]  # x [D] -> scalar
@@ -65,6 +66,23 @@ def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Ar
     up, down = at(jnp.asarray(unit[angle] * np.pi / 2)), at(jnp.asarray(-unit[angle] * np.pi / 2))
     cosine = (origin - at(jnp.asarray(unit[angle] * np.pi))) / 2
     return jnp.concatenate([linear, (up - down) / 2, cosine]).T, origin - jnp.sum(cosine, 0)
+
+
+def widened(cost: Cost, factor: Array | float) -> Cost:
+    """The cost of `factor` times the width: in closed form where that is known, else 1 - (1 - c)^(1 / factor^2).
+
+    Both are the same for c = 1 - exp(-e^2 / (2 width^2)); for any other c in [0, 1] the order of states stays. The
+    slope would be infinite at c = 1: from one rounding error below it on, and above it, the slope is that of c.
+    """
+    if cost.widen is not None:
+        return cost.widen(factor)
+
+    def of_state(x: Array) -> Array:
+        rest = 1 - _scalar(cost.of_state(x))
+        least = jnp.finfo(rest.dtype).eps
+        return 1 - jnp.maximum(rest, least) ** factor**-2 + jnp.maximum(least - rest, 0)
+
+    return Cost(of_state)
 
 
 def blind_to_memory(cost: Cost, states: int) -> Cost:
@@ -113,12 +131,7 @@ def normal_nodes(count: int, size: int) -> np.ndarray:
 def of_particles(cost: Cost) -> Callable[[Array], Array]:
     """The cost of every particle: x [H, K, D] -> [H, K]. Raises ValueError where a state's cost is no scalar."""
 
-    def one(x: Array) -> Array:
-        value = cost.of_state(x)
-        check_shape("the cost of one state", value, ())
-        return value
-
-    return jax.vmap(jax.vmap(one))
+    return jax.vmap(jax.vmap(lambda x: _scalar(cost.of_state(x))))
 
 
 def of_particles_mean(cost: Cost) -> Callable[[Array], Array]:
@@ -158,3 +171,9 @@ def mean(costs: Array) -> Array:
 def total(costs: Array) -> Array:
     """Cost of an episode, averaged over particles: the paper's eq. 1 and Alg. 3 line 15."""
     return jnp.sum(jnp.mean(costs, 1))
+
+
+def _scalar(value: Array) -> Array:
+    """A state's cost, if it is one number. Raises ValueError."""
+    check_shape("the cost of one state", value, ())
+    return value

@@ -84,8 +84,7 @@ def to_task(found: Any, where: str) -> Task:
 
     if "constraint_bound" in found:
         known["constraint"] = Constraint(unknown_cost, _numbers([found["constraint_bound"]], 1)[0])
-    cost = Cost(unknown_cost, unknown_cost, lambda factor: cost)  # as wide as may be asked: it is never computed
-    task = Task(plant=None, cost=cost, **known)
+    task = Task(plant=None, cost=Cost(unknown_cost, unknown_cost), **known)
     return _asking(task, found, where) if "terms" in found else task
 
 
