@@ -159,7 +159,7 @@ class Cost(NamedTuple):
     of_state: Callable[[Array], Array]  # x [D] -> scalar
     # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not in closed form, but by costs.expected_by_nodes
     expected: Callable[[Array, Array], Array] | None = None
-    widen: "Callable[[Array], Cost] | None" = None  # factor -> the cost of that many widths; None: costs.widened
+    widen: "Callable[[Array | float], Cost] | None" = None  # times the width -> that cost; None: costs.widened
 
 
 class TrainState(NamedTuple):
