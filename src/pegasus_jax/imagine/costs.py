@@ -30,7 +30,6 @@ __all__ = [
 
 OfState = Callable[[Array], Array]  # x [D] -> scalar
 Error = Callable[[Array], Array]  # x [D] -> e [E], affine in the features of x
-Expected = Callable[[Array, Array], Array]  # (mean [D], cov [D, D]) of a Gaussian state -> scalar
 
 
 def saturating(error: Error, width: Array | float, angles: tuple[int, ...]) -> Cost:
@@ -71,18 +70,15 @@ def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Ar
 def widened(cost: Cost, factor: Array | float) -> Cost:
     """The cost of `factor` times the width: in closed form where that is known, else 1 - (1 - c)^(1 / factor^2).
 
-    Both are the same for c = 1 - exp(-e^2 / (2 width^2)); for any other c in [0, 1] the order of states stays. The
-    slope would be infinite at c = 1: from one rounding error below it on, and above it, the slope is that of c.
+    They are the same for c = 1 - exp(-e^2 / (2 width^2)); for any other c in [0, 1] the order of states stays.
     """
-    if cost.widen is not None:
-        return cost.widen(factor)
 
     def of_state(x: Array) -> Array:
         rest = 1 - _scalar(cost.of_state(x))
-        least = jnp.finfo(rest.dtype).eps
-        return 1 - jnp.maximum(rest, least) ** factor**-2 + jnp.maximum(least - rest, 0)
+        held = jnp.maximum(rest, jnp.finfo(rest.dtype).eps)  # at c = 1 the slope is infinite: there take that of c
+        return 1 - held**factor**-2 + (held - rest)
 
-    return Cost(of_state)
+    return Cost(of_state) if cost.widen is None else cost.widen(factor)
 
 
 def blind_to_memory(cost: Cost, states: int) -> Cost:
@@ -95,12 +91,12 @@ def blind_to_memory(cost: Cost, states: int) -> Cost:
     )
 
 
-def expectation(cost: Cost) -> Expected:
-    """The expected cost of a Gaussian state: in closed form where that is known, else by nodes."""
+def expectation(cost: Cost) -> Callable[[Array, Array], Array]:
+    """The expected cost of a state's (mean [D], cov [D, D]): in closed form where that is known, else by nodes."""
     return cost.expected or expected_by_nodes(cost.of_state)
 
 
-def expected_by_nodes(of_state: OfState, *, nodes: int = 512) -> Expected:
+def expected_by_nodes(of_state: OfState, *, nodes: int = 512) -> Callable[[Array, Array], Array]:
     """The expectation of any cost of a Gaussian state x [D]: the mean over as many fixed nodes, at least 2 D.
 
     Quasi-Monte Carlo with `normal_nodes`: exact for a cost that is a constant, linear or quadratic in x.
