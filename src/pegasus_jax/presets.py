@@ -96,7 +96,7 @@ def swimmer(maneuver: str, legs: int) -> Config:
     )
 
 
-# A cost of one's own has no width to widen; its expectation is a mean over nodes: docs/decisions.md 0018. Such a plant
+# A cost of one's own is not widened: docs/decisions.md 0031. Its expectation is a mean over nodes: 0018. Such a plant
 # may start anywhere: 0024. It is to hold for longer than an episode: 0023.
 _OWN_PLANT = Search(
     cost_width_start=1.0, standardized_noise=True, refine_fraction=0.5, matching="narrow", visited_starts=0.5
