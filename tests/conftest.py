@@ -40,8 +40,8 @@ settings.load_profile("repository")
 
 
 # The files that take minutes: begun first, so that at the end no core waits for another's last file.
-LONG = ("test_docs", "test_family", "test_train", "test_campaigns", "test_seeds", "test_examples", "test_robot")
-LONG += ("test_build", "test_notebooks", "test_packaging", "test_api", "test_export", "test_build_search")
+LONG = ("test_docs", "test_train", "test_family", "test_campaigns", "test_examples", "test_robot", "test_seeds")
+LONG += ("test_api", "test_export", "test_build_search")
 QUICK = 120  # CPU seconds that a test of `make test` may take, on any machine; those there are take up to 20 here
 
 

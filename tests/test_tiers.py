@@ -1,7 +1,6 @@
 """Every test is run by one target of the Makefile; CI runs all but the long campaigns; `make test` is quick."""
 
 import re
-import shlex
 from contextlib import suppress
 from itertools import product
 from pathlib import Path
@@ -30,14 +29,10 @@ def test_one_target_runs_a_test(marked: tuple[bool, ...]) -> None:
     assert (chosen == ["test"]) == (not any(marked))
 
 
-@pytest.mark.parametrize("marked", [*product((False, True), repeat=len(TIERS))])
-def test_ci_runs_all_but_the_long_campaigns(marked: tuple[bool, ...]) -> None:
-    """By the target that README names; of two -m pytest takes the last."""
-    make, target, words = shlex.split((ROOT / ".ci" / "run").read_text().splitlines()[-1])
-    option, expression = shlex.split(words.removeprefix("ARGS="))
-    assert (make, target, option) == ("make", "test", "-m")
-    known = dict(zip(TIERS, marked, strict=True))
-    assert eval(expression, known) == (not eval(selected_by("campaigns"), known))
+def test_ci_runs_all_but_the_long_campaigns() -> None:
+    last = (ROOT / ".ci" / "run").read_text().splitlines()[-1].split()
+    assert last[0] == "make"
+    assert {*last[1:]} == {*TARGETS} - {"campaigns"}
 
 
 def test_a_test_that_takes_long_has_to_say_so(monkeypatch: pytest.MonkeyPatch) -> None:
