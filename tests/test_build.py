@@ -195,12 +195,12 @@ def small_pilco(model, policy, task, **search):
     return compose(dataclasses.replace(tiny(trials=2), **sections), task, dynamics=dynamics)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.parametrize(
     ("model", "policy", "task"),
     [
         ("gp", config.Linear(), cart),
-        pytest.param("ssgp", config.RBF(num_centers=4), dial, marks=pytest.mark.campaign),
+        ("ssgp", config.RBF(num_centers=4), dial),
     ],
     ids=["gp-linear", "ssgp-rbf"],
 )

@@ -240,8 +240,9 @@ def test_the_command_says_what_it_wrote(runs: dict[str, Path], capsys: pytest.Ca
     cli.handle([str(run), "trial=last", "overwrite=true"])
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == f"{run}/controller.py: The controller after trial 2 of linear-double, task cartpole"
-    assert lines[1] == f"{run}/controller.py.json: its contract"
-    assert lines[2].startswith("1,000 observations, 52 of them stored: it differs from the policy by at most ")
+    assert lines[1] == "newest policy: trial 2"
+    assert lines[2] == f"{run}/controller.py.json: its contract"
+    assert lines[3].startswith("1,000 observations, 52 of them stored: it differs from the policy by at most ")
     for words, complaint in (
         (["trial=x"], "trial=x is not a trial"),
         (["overwrite=yes"], "overwrite=yes is neither"),

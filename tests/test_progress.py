@@ -124,7 +124,7 @@ def test_what_will_be_done_and_how_to_go_on(tmp_path: Path) -> None:
     run = tmp_path / "my run"
     run.mkdir()
     (run / "config.yaml").touch()
-    assert f"pegasus-train resume='{run}' goes on" in stopped(run)
+    assert f"pegasus-train 'resume={run}' goes on" in stopped(run)
 
 
 class Watch:
