@@ -32,7 +32,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return a_run(tmp_path_factory.mktemp("runs") / "run", trials=1)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_film_of_a_tiny_run(run: Path) -> None:
     done = call("play", run, "seed=3", cwd=run.parent, **OPTIMISED)
     assert (done.returncode, done.stderr.startswith("best policy: trial 1")) == (0, True), done.stderr

@@ -223,7 +223,7 @@ def test_devices_that_are_not_there_are_one_clear_line(word: str, message: str, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_folder_of_seeds_is_drawn_and_kept(study: Path) -> None:
     plotted = call("plot", study, cwd=study.parent)
     assert plotted.returncode == 0, plotted.stderr

@@ -87,7 +87,7 @@ def test_a_run_leaves_everything(whole: Path) -> None:
     assert "jax" in about["versions"]
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_nothing_is_learned_between_random_episodes(tmp_path: Path) -> None:
     run = tmp_path / "run"
     done = call("train", *TINY, "explore.trials=2", "track=tensorboard", f"out={run}", cwd=tmp_path)
@@ -273,7 +273,7 @@ def test_more_trials_after_the_end(whole: Path, tmp_path: Path) -> None:
     assert "trials=2 is fewer than the 4 that are done" in fewer.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_run_goes_on_with_another_search(whole: Path, tmp_path: Path) -> None:
     """Also with one whose optimizer remembers more; what was learned and written before stays as it is."""
     run = copy_until(whole, tmp_path / "run", 9)
