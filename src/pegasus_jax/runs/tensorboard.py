@@ -24,7 +24,8 @@ class Board:
         self._folder, self._first, self._say, self._writer = folder, first, say, None
         try:
             folder.mkdir(parents=True, exist_ok=True)
-            self._writer = EventsWriter(str(folder / "events"))
+            # Its name ends with a second: a run that goes on within the same one would write over the file before.
+            self._writer = EventsWriter(str(folder / "events"), f".{time.time_ns()}")
         except OSError as error:
             self._stop(error)
         version = Event(step=first, file_version="brain.Event:2")
