@@ -13,7 +13,7 @@ from test_docs import blocks, commands, shell, tools  # noqa: F401 (tools is a f
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 SCRIPTS = sorted(EXAMPLES.glob("*.py"))
-LONG = pytest.mark.campaign  # as long as a page of the documentation
+PAGES_HAVE_NOT = ("own_model_in_jit", "own_robot")  # what the others do, pages do too
 COMMANDS = [command for block in blocks(EXAMPLES / "README.md") for command in commands(block)]
 SMALL = "trials=2 fit=3 search=2"  # of a script's own words
 SETTINGS = "trials=2 fit.steps=3 search.steps=4 model.hidden=[8] policy.hidden=[8]"  # of a command
@@ -39,7 +39,10 @@ def commands_of(script: Path) -> list[str]:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     "script",
-    [pytest.param(path, id=path.stem, marks=LONG if path.stem == "study" else ()) for path in SCRIPTS],
+    [
+        pytest.param(path, id=path.stem, marks=() if path.stem in PAGES_HAVE_NOT else pytest.mark.campaign)
+        for path in SCRIPTS
+    ],
 )
 def test_an_example_runs_as_it_stands(script: Path, folder: Path, tools: dict[str, str]) -> None:  # noqa: F811
     before = {path.name for path in folder.iterdir()}

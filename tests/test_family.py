@@ -43,18 +43,13 @@ TURNS = [
     for i, model in enumerate(MODELS)
     for j, policy in enumerate(PIECES)
 ]
-PAIRS = [(model, policy) for model in ("binary", "log_normal") for policy in ("mlp", "rbf", "dropout_mlp")]
 # What else the paper's figures run, all of them matched.
 PAPER = [("log_normal", "dropout_mlp"), ("binary", "mlp"), ("binary", "rbf"), ("concrete", "dropout_mlp")]
 FAMILY = [*TURNS, *((*pair, "matched") for pair in PAPER), *MOMENTS]
 # Of make test: each model once, each policy and each way at least twice.
 QUICK = [TURNS[len(PIECES) * i + (i + i // 2) % len(PIECES)] for i in range(len(MODELS))]
-# Of make test-slow: the pairs that the paper's figures run. The others say no more of a piece that is in these.
-SLOW = [
-    *((model, policy, how) for model, policy, how in TURNS if (model, policy) in PAIRS),
-    *((*pair, "matched") for pair in PAPER),
-    ("gp", "linear", "analytic"),  # ssgp's takes three quarters of a minute
-]
+# Of make test-slow: PILCO. The others, the paper's pairs too, say no more of a piece that is in these.
+SLOW = [("gp", "linear", "analytic")]  # ssgp's takes three quarters of a minute
 MARKS = dict.fromkeys(SLOW, pytest.mark.slow) | dict.fromkeys(QUICK, ())
 MEMBERS = [
     pytest.param(*member, id="-".join(member), marks=MARKS.get(member, pytest.mark.campaign)) for member in FAMILY

@@ -150,7 +150,7 @@ print(sum("XLAEigen" in path.read_text() for path in pathlib.Path("/proc/self/ta
     assert int(found.stdout) == (threads or machine.cpus())
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_killed_and_resumed_is_bit_equal(study: Path, tmp_path: Path) -> None:
     """Killed when one seed's second episode is on disk and the other's perhaps not."""
     folder = tmp_path / "killed"

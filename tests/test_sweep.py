@@ -112,7 +112,7 @@ def test_printed_commands_are_those_of_the_runs(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 @pytest.mark.skipif(find_spec("submitit") is None, reason="the extra `sweep` is not installed")
 def test_a_sweep_on_this_machine_leaves_ordinary_runs(tmp_path: Path) -> None:
     done = call(*TINY, "trials=1", "seed=1,2", "jobs=1", "launcher=local", "out=sweep", cwd=tmp_path)
