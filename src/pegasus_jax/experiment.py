@@ -17,7 +17,7 @@ from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.models.calibration import calibration
-from pegasus_jax.policies.driven import driver
+from pegasus_jax.policies.driver import driver
 from pegasus_jax.policies.rate_limited import before, explored
 from pegasus_jax.shapes import check_shape
 from pegasus_jax.task import Task

@@ -1,6 +1,5 @@
 """pegasus-check: what a task is like, and what would go wrong, before anything moves; pegasus-train asks it first."""
 
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +10,7 @@ from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math.circles import entries
+from pegasus_jax.math.units import parted
 from pegasus_jax.policies.rate_limited import largest_change
 from pegasus_jax.runs import first
 from pegasus_jax.runs.logged import read_config
@@ -103,10 +103,10 @@ def turning(facts: cost_check.Facts, names: tuple[str, ...]) -> list[str]:
     places = entries(len(facts.start_mean) + len(facts.circles), facts.circles)
     notes = []
     for entry, name in enumerate(names):
-        unit = re.search(r"\[(.*)\]$", name)
-        if unit and unit[1] == "rad" and entry not in facts.angles:
+        _, unit = parted(name)
+        if unit == "rad" and entry not in facts.angles:
             notes.append(f"{name} is not among angles=; if it can turn around, angles=[{places[entry]}]")
-        elif unit and unit[1] != "rad" and entry in facts.angles:
+        elif unit not in (None, "rad") and entry in facts.angles:
             notes.append(f"angles=[{places[entry]}]: {name} is said to be an angle, and its unit is not rad")
     return notes
 

@@ -118,4 +118,4 @@ def refuse(text: str) -> NoReturn:
 
 def part(tree: Any, index: int) -> Any:
     """One seed's part of a tree of arrays [S, ...]."""
-    return jax.tree.map(lambda leaf: leaf[index], gather(tree))
+    return jax.tree.map(lambda leaf: leaf[index], tree)
