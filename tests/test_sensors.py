@@ -7,6 +7,7 @@ import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
+import onnxruntime
 import pytest
 from scipy.signal import savgol_filter
 
@@ -206,48 +207,95 @@ def test_a_fit_in_rounds_makes_all_its_updates(steps):
     assert [drawn for _, drawn in seen] == [float(i >= 0.1 * (steps // 50 or 1)) for i in range(rounds)]
 
 
+ASKED = {  # by the names of its parameters, what a cost takes of a policy that remembers is asked for at each call
+    "difference": lambda x, reference: 1 - jnp.exp(-((x[0] - reference[0]) ** 2)),
+    "history": lambda x, goal: 1 - jnp.exp(-((x[0] - goal[0]) ** 2)),
+    "slow": lambda x, t: 1 - jnp.exp(-((x[0] - t) ** 2)),
+}
 SETTINGS = {
     "difference": "sensors.measured=[0,3] sensors.velocity=difference sensors.delay=1",
     "filter": "sensors.measured=[0,3] sensors.velocity=filter sensors.cutoff=1.5 x64=true",
-    "history": "sensors.measured=[0,3] history=3 sensors.delay=1 model=log_normal",
+    "history": "sensors.measured=[0,3] history=3 sensors.delay=1 model=log_normal goal_low=[-1,0] goal_high=[1,2]",
     "late": "sensors.delay=2",
     "slow": "control_rate=20",
 }
+FORMATS = ("numpy", *(["c"] if any(map(as_c.shutil.which, as_c.COMPILERS)) else []), "onnx", "stablehlo")
 
 
 @pytest.fixture(scope="module", params=SETTINGS)
 def sensor_run(request, tmp_path_factory):
-    """A run whose controller remembers."""
-    words = dict(word.split("=", 1) for word in SETTINGS[request.param].split())
-    config = config_io.parse({"task": "cartpole", **words})
-    task = sensed(tasks.make("cartpole"), config.sensors)
+    """A run whose controller remembers. Where rates are computed, a cosine and a sine are seen."""
+    name, words = request.param, dict(word.split("=", 1) for word in SETTINGS[request.param].split())
+    asked = {"cost": ASKED[name]} if name in ASKED else {}
+    asked |= {"reference": lambda t: jnp.sin(t)} if name == "difference" else {}
+    task = tasks.of_config(config_io.parse({"task": "cartpole", **words, **asked}))
+    task = task._replace(circles=((1, 2),)) if "velocity" in SETTINGS[name] else task
     changes = {key.replace(".", "__"): value for key, value in words.items()} | {"search__particles": "16"}
-    return request.param, folders.a_run(tmp_path_factory.mktemp("run") / "run", made=task, **changes)
+    return name, folders.a_run(tmp_path_factory.mktemp("run") / "run", made=task, trials=2, **changes)
+
+
+def episode_of(name, control, steps=12):
+    """An episode's observations [L, O], of a file, and what `controller` does: all that is asked for is told it."""
+    sensors = {"filter": 3, "difference": 3, "history": 2}.get(name, 4)
+    x = np.random.default_rng(3).normal(size=(steps, sensors)) * [1, *[3] * (sensors - 1)]
+    now, ahead = 0.1 * np.arange(steps)[:, None], np.array([0, 0.1, 0.3])
+    asked = {"difference": np.cos(now + ahead), "history": np.full((steps, 2), [0.3, -0.7]), "slow": now}
+    control.reset()
+    if name == "history":
+        control.goal = [0.3, -0.7]
+    if name == "difference":
+        control.reference = np.cos
+    return np.concatenate([x, asked.get(name, now[:, :0])], 1), np.stack([control(row) for row in x])
 
 
 def test_a_file_remembers_as_the_controller_does(sensor_run):
-    """Written, compared on 1,000 observations in episodes of 20, and kept; its contract says what it remembers."""
+    """Compared with the policy on 1,000 observations in episodes of 20; its contract says what it remembers."""
     name, run_of = sensor_run
-    for format in ("numpy", *(["c"] if any(map(as_c.shutil.which, as_c.COMPILERS)) else [])):
-        said = json.loads(write.contract_of(write.export(run_of, 2, format)).read_text())
-        assert said["parity"]["largest_difference"] <= said["parity"]["allowed"]
-        assert len(said["observation"]) == (4 if name in ("late", "slow") else 2)
+    rows, expected = episode_of(name, controller(run_of, 2))
+    for format in FORMATS:
+        file = write.export(run_of, 2, format)
+        said = json.loads(write.contract_of(file).read_text())
+        assert said["parity"]["largest_difference"] <= said["parity"]["allowed"] < 2e-5
+        found = write.FORMATS[format].run(file, rows.astype(expected.dtype))
+        # Of the policy that is told its own controls alone, roundings grow along an episode.
+        np.testing.assert_allclose(found, expected, rtol=0, atol=0.02 if name == "late" else 2e-4)
+        assert len(said["observation"]) == rows.shape[1]
+        sensors = [entry["name"] for entry in said["observation"] if entry.get("is") != "asked for, no sensor's"]
+        told = {"difference": 3, "history": 2, "slow": 1}.get(name, 0)
+        assert len(sensors) == rows.shape[1] - told
         kept = {"difference": 2, "filter": 1, "history": 3, "late": 2, "slow": 1}
         assert said["history"]["controls"] == kept[name]
         assert said["control"][0].get("rate_per_s") == (20 if name == "slow" else None)
-        assert (said["filter"] != "none") == (name in ("difference", "filter"))
-    with pytest.raises(ConfigError, match=r"format=onnx cannot write a controller that remembers .* format=numpy"):
-        write.export(run_of, 2, "onnx")
+        assert (said["filter"] == "none") == (name not in ("difference", "filter"))
+        assert ("memory" in said) == (format in ("onnx", "stablehlo"))
+    assert np.ptp(expected) > 0.5
+    zeros_begin_an_episode(run_of, rows[:3].astype(expected.dtype), expected)
+
+
+def zeros_begin_an_episode(run_of, rows, expected):
+    """In each row of a batch by itself; a memory that is handed on is the episode so far."""
+    said = json.loads((run_of / "controller.onnx.json").read_text())
+    session = onnxruntime.InferenceSession(run_of / "controller.onnx", providers=["CPUExecutionProvider"])
+    memory = begun = np.array([[entry["initial"] for entry in said["memory"]]], rows.dtype)
+    for x, u in zip(rows, expected, strict=False):
+        both = {"observation": np.stack([rows[0], x]), "memory": np.concatenate([begun, memory])}
+        control, after = session.run(["control", "next_memory"], both)
+        np.testing.assert_allclose(control, [expected[0], u], atol=2e-4)
+        memory = after[1:]
+    act = jax.export.deserialize(bytearray((run_of / "controller.stablehlo").read_bytes())).call
+    with jax.enable_x64(rows.dtype == np.float64):
+        control, after = act(rows[0], begun[0])
+        np.testing.assert_allclose(act(rows[1], after)[0], expected[1], atol=2e-4)
 
 
 def test_a_reset_forgets_the_episode(sensor_run):
     name, run_of = sensor_run
-    control, size = controller(run_of, 2), 4 if name in ("late", "slow") else 2
-    first, second = np.full(size, 0.1), np.full(size, 0.4)
-    fresh = control(second)
+    control = controller(run_of, 2)
+    rows, expected = episode_of(name, control, steps=2)
+    second = rows[1, : {"difference": 3, "history": 2, "slow": 4}.get(name)]
     control.reset()
-    control(first)
-    assert not np.allclose(control(second), fresh, rtol=1e-6)
+    fresh = control(second)
+    assert not np.allclose(expected[1], fresh, rtol=1e-6)
     control.reset()
     np.testing.assert_array_equal(control(second), fresh)
 

@@ -15,7 +15,7 @@ from pegasus_jax import episode, memory, tasks
 from pegasus_jax.assembly.experiments import build, compose
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.exports.drive import drives
-from pegasus_jax.exports.write import export
+from pegasus_jax.exports.write import FORMATS, export
 from pegasus_jax.imagine import costs
 from pegasus_jax.runs import config_io, facts
 from pegasus_jax.runs.check import before_training
@@ -298,7 +298,8 @@ def test_the_controller_is_given_goals_and_references(tmp_path):
     words = dict(cost=price, reference=sine, goals=goals, **SMALL)
     task = tasks.whole(tasks.of_config(parse(task="cartpole", **words)))
     plain = {name.replace(".", "__"): value for name, value in SMALL.items() if name not in ("model", "trials")}
-    control = controller(a_run(tmp_path / "run", made=task, **plain), trial="last")
+    run = a_run(tmp_path / "run", made=task, **plain)
+    control = controller(run, trial="last")
     _, experiment, state = restored(tmp_path / "run")
     x = np.array([0.1, -0.2, 0.3, 3.0])
     with pytest.raises(ValueError, match="set goal, 2 numbers, before it is called"):
@@ -306,9 +307,11 @@ def test_the_controller_is_given_goals_and_references(tmp_path):
     with pytest.raises(ValueError, match="a goal is 2 finite numbers"):
         control.goal = [1.0]
 
+    def seen(t, reference):
+        return jnp.array([*x, t, *(reference(t + ahead) for ahead in (0, 0.1, 0.3)), 0.2, -0.1])
+
     def by_hand(t, reference):
-        seen = [*x, t, *(reference(t + ahead) for ahead in (0, 0.1, 0.3)), 0.2, -0.1]
-        return experiment.policy.apply(state.policy.params, None, jnp.array(seen))
+        return experiment.policy.apply(state.policy.params, None, seen(t, reference))
 
     control.goal = [0.2, -0.1]
     for reference in (sine, lambda t: 0.3 + 0 * t):
@@ -316,6 +319,11 @@ def test_the_controller_is_given_goals_and_references(tmp_path):
         for period in range(3):
             np.testing.assert_allclose(control(x), by_hand(0.1 * period, reference), rtol=1e-4)
         control.reference = 0.3
+    for format in ("numpy", "onnx", "stablehlo"):  # a file that is asked, and remembers nothing
+        made = FORMATS[format]
+        rows = np.stack([seen(t, sine) for t in (0.0, 0.2)])
+        found = made.run(export(run, "last", format, tmp_path / f"asked{made.suffix}"), rows)
+        np.testing.assert_allclose(found, [by_hand(t, sine) for t in (0.0, 0.2)], rtol=1e-4)
     control.reference = [0.3, 0.4]
     with pytest.raises(ValueError, match="a reference is 1 finite numbers"):
         control(x)
@@ -331,7 +339,8 @@ def hold(x, u, previous_u, goal):
 def test_a_robot_with_goals_from_the_first_episode_to_the_file_that_drives_it(tmp_path):
     """What is stored can be counted again by hand, and the file is the controller that was asked for the goal."""
     small = SMALL | {"eval_episodes": "0", "horizon": "6", "env": "Pendulum-v1", "circles": "[[0,1]]"}
-    small |= {"goal_low": "[-0.3]", "goal_high": "[0.3]", "search.visited_starts": "0"}
+    small |= {"goal_low": "[-0.3]", "goal_high": "[0.3]", "search.visited_starts": "0", "control_rate": "20"}
+    small |= {"state_names": "[cosine,sine,rate]"}
     run = train("gym", out=tmp_path / "run", settings=small, cost=hold)
     drawn = []
     for trial in (1, 2):
@@ -348,12 +357,16 @@ def test_a_robot_with_goals_from_the_first_episode_to_the_file_that_drives_it(tm
     for goal in (-0.2, 0.1):
         control.goal = goal
         np.testing.assert_allclose(file([*x, goal]), control(x), rtol=1e-4)
-    assert control([0.6, 0.8, 0.1]) != file([0.6, 0.8, 0.1, -0.2])
     kept = json.loads((tmp_path / "hold.py.json").read_text())
+    assert [entry["name"] for entry in kept["observation"]] == ["cosine", "sine", "rate", "goal 0"]
     assert kept["observation"][-1] == {"name": "goal 0", "unit": None, "is": "asked for, no sensor's"}
-    assert (kept["filter"], kept["history"]) == ("none", "none")
+    assert (kept["filter"], kept["history"]["controls"], kept["control"][0]["rate_per_s"]) == ("none", 1, 20)
     (done,) = drives(run)
     driven = np.load(done.log)
+    control.reset()
+    control.goal = driven["memory"][-1:]
+    np.testing.assert_allclose(driven["u"], [control(row) for row in driven["observation"][:-1]], atol=1e-4)
+    assert np.abs(np.diff(driven["u"], axis=0, prepend=0)).max() <= 1 + 1e-6  # 20 a second, of .05 s
     assert driven["cost"].shape == (6,)
     assert abs(driven["memory"][-1]) <= 0.3
     before = np.concatenate([np.zeros((1, 1), np.float32), driven["u"][:-1]])

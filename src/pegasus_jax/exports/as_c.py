@@ -215,7 +215,8 @@ def _recalled(layer: Recall, v: str) -> list[str]:
     for name, first, size in (("past", n, controls), ("rows", n + controls, rows), ("rate", n + controls + rows, n)):
         if size and (layer.rates or name != "rate"):
             lines.append(f"for (int i = 0; i < {size}; ++i) {v}[{first} + i] = @P_{name}[i];")
-    return lines
+    first = layer.size - len(layer.asked)
+    return lines + [f"{v}[{first + i}] = x[{entry}];" for i, entry in enumerate(layer.asked)]
 
 
 def _remembered(layer: Recall) -> list[str]:

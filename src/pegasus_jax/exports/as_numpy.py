@@ -89,8 +89,9 @@ def act(observation, memory=None):
 def write(learned: Learned, name: str) -> bytes:
     """The module's text. Raises ConfigError for a policy that is no list of layers."""
     code, arrays, sizes = [], {}, (len(learned.observation), len(learned.task.control_names))
-    remembers = bool(learned.task.memory.names)
-    for number, layer in enumerate(layers_of(learned, "numpy")):
+    layers = layers_of(learned, "numpy")
+    remembers = any(isinstance(layer, Recall) for layer in layers)
+    for number, layer in enumerate(layers):
         lines, used = _printed(layer, number)
         code += lines
         arrays |= used
@@ -165,7 +166,8 @@ def _recalled(layer: Recall) -> tuple[list[str], dict[str, np.ndarray]]:
         lines.append("change = q - before")
         lines += [f"{turn} = np.arctan2(np.sin({turn}), np.cos({turn}))"] if layer.turning else []
         lines.append(f"rate = rate + x.dtype.type({layer.weight!r}) * (change / x.dtype.type({layer.dt!r}) - rate)")
-    lines.append(f"x = np.concatenate([q, past, rows{', rate' * layer.rates}])")
+    asked = f", x[{list(layer.asked)}]" if layer.asked else ""
+    lines.append(f"x = np.concatenate([q, past, rows{', rate' * layer.rates}{asked}])")
     return lines, {"REST": layer.rest}
 
 

@@ -13,6 +13,8 @@ from pegasus_jax.memory import resting
 from pegasus_jax.runs.machine import about
 from pegasus_jax.tasks.remembered import kept_by
 
+EXPLICIT = ("onnx", "stablehlo")  # formats of functions, whose caller keeps the memory
+
 
 def contract(learned: Learned, format: str, file: Path, data: bytes, parity: Parity, command: str) -> dict[str, Any]:
     """The contract of a file of these bytes. Observations and controls are in the order of their entries."""
@@ -34,7 +36,7 @@ def contract(learned: Learned, format: str, file: Path, data: bytes, parity: Par
         "observation": [
             named(name)
             | ({"is": f"{cosines[i]} of an angle"} if i in cosines else {})
-            | ({"is": "asked for, no sensor's"} if i >= len(learned.observation) - len(learned.asked) else {})
+            | ({"is": "asked for, no sensor's"} if i >= len(learned.sensors) else {})
             for i, name in enumerate(learned.observation)
         ],
         "control": [
@@ -42,7 +44,12 @@ def contract(learned: Learned, format: str, file: Path, data: bytes, parity: Par
             for i, (name, low, high) in enumerate(controls)
         ],
         **_memory(learned),
-        "parity": {**parity._asdict(), "allowed": parity.allowed, "against": "pegasus_jax.controller"},
+        **_memory_of_caller(learned, format),
+        "parity": {
+            **parity._asdict(),
+            "allowed": parity.allowed,
+            "against": "the policy, as pegasus_jax.controller has it",
+        },
         "command": command,
         "versions": about(command)["versions"],
     }
@@ -51,15 +58,22 @@ def contract(learned: Learned, format: str, file: Path, data: bytes, parity: Par
 def _memory(learned: Learned) -> dict[str, Any]:
     """What the file remembers of an episode, from `reset` on: its filter, and past observations and controls."""
     task = learned.task
-    if not task.memory.names:
+    if not learned.memory.names:
         return {"filter": "none", "history": "none"}
     kept = kept_by(learned.config, task)
     rest = resting(task).astype(float).tolist()
-    rates = {"rates_of": [*learned.observation], "computed_by": "difference", "weight_of_the_newest": kept.weight}
+    rates = {"rates_of": [*learned.sensors], "computed_by": "difference", "weight_of_the_newest": kept.weight}
     return {
         "filter": rates if kept.rates else "none",
         "history": {"controls": kept.controls, "observations": kept.rows, "controls_before_an_episode": rest},
     }
+
+
+def _memory_of_caller(learned: Learned, format: str) -> dict[str, Any]:
+    """What a caller hands on from call to call, of a file that keeps nothing itself."""
+    if format not in EXPLICIT or not learned.remembered:
+        return {}
+    return {"memory": [{"name": name, "initial": 0.0} for name in learned.remembered]}
 
 
 def named(name: str) -> dict[str, Any]:

@@ -13,14 +13,15 @@ from pegasus_jax.math.circles import entries
 from pegasus_jax.pilco.rbf import regress
 from pegasus_jax.policies.rate_limited import largest_change
 from pegasus_jax.runs.restore import precision
-from pegasus_jax.tasks.remembered import kept_by, remembering
-from pegasus_jax.types import NO_MEMORY
+from pegasus_jax.tasks import input_scale
+from pegasus_jax.tasks.remembered import kept_by
 
 
 class Recall(NamedTuple):
     """v = the state [n] of the observation, then what is remembered of an episode; see tasks/remembered.py.
 
-    Past controls, newest first, then past states, newest first, then the rates of `positions` [n] of the state.
+    Past controls, newest first, then past states, newest first, then the rates of the state. Last come entries of the
+    observation that are `asked` for.
     """
 
     state: tuple[tuple[int, ...], ...]  # [n] (entry of the observation,), or those of a cosine and a sine of an angle
@@ -31,11 +32,23 @@ class Recall(NamedTuple):
     rates: bool
     weight: float  # of the newest difference in a rate
     dt: float  # [s]
+    asked: tuple[int, ...]
 
     @property
     def size(self) -> int:
         """Entries of v."""
-        return len(self.state) * (1 + self.rows + self.rates) + self.controls * len(self.rest)
+        return len(self.state) * (1 + self.rows + self.rates) + self.controls * len(self.rest) + len(self.asked)
+
+    @property
+    def parts(self) -> dict[str, int]:
+        """The sizes of what is remembered: past controls, past states, the state before, and filtered rates."""
+        n, filtered = len(self.state), self.rates and self.weight < 1
+        return {
+            "past": self.controls * len(self.rest),
+            "rows": self.rows * n,
+            "before": self.rates * n,
+            "rate": filtered * n,
+        }
 
 
 class Features(NamedTuple):
@@ -127,46 +140,36 @@ def layers_of(learned: Learned, format: str) -> tuple[Layer, ...]:
     )
 
 
-def forgetful(learned: Learned, format: str) -> None:
-    """Raises ConfigError for a policy that remembers, which a format cannot express."""
-    if learned.task.memory.names:
-        raise ConfigError(
-            f"format={format} cannot write a controller that remembers {learned.task.memory.names[0]};"
-            " the nearest are format=numpy and format=c"
-        )
-
-
 def _features(learned: Learned) -> tuple[Layer, ...]:
     """Where the features of what the policy sees are in the observation, and in what is remembered."""
-    task, measured = learned.task, recall.measured(learned.task)
+    task, measured, sensors = learned.task, recall.measured(learned.task), len(learned.sensors)
     pair_at = {min(pair): tuple(pair) for pair in task.circles}
-    kept = [pair_at.get(entry, (entry,)) for entry in entries(len(measured) + len(task.circles), task.circles)]
-    turning = recall.seen_angles(task)
-    if not task.memory.names:
-        plain = tuple(entry for i, (entry, *_) in enumerate(kept) if i not in turning)
-        return (Features(plain, tuple(kept[i] for i in turning)),)
-    kept_of, own = kept_by(learned.config, task), remembering(learned.config, task._replace(memory=NO_MEMORY))
-    if own.memory.shown != task.memory.shown:
-        raise ConfigError(f"{', '.join(task.memory.shown)}: no file can remember that; pegasus_jax.controller does")
-    layer = Recall(
-        state=tuple(kept),
-        rest=_array(recall.resting(task), learned.dtype),
-        controls=kept_of.controls,
-        rows=kept_of.rows,
-        turning=tuple(measured.index(i) for i in task.angles if i in measured),
-        rates=kept_of.rates,
-        weight=kept_of.weight,
-        dt=float(task.dt),
-    )
-    seen = range(layer.size)
-    return layer, Features(tuple(i for i in seen if i not in turning), tuple((i,) for i in turning))
+    kept = [pair_at.get(entry, (entry,)) for entry in entries(sensors, task.circles)]
+    asked = range(sensors, len(learned.observation))
+    seen, turning, first = [*kept, *((entry,) for entry in asked)], recall.seen_angles(task), ()
+    if learned.memory.names:
+        kept_of = kept_by(learned.config, task)
+        layer = Recall(
+            state=tuple(kept),
+            rest=_array(recall.resting(task), learned.dtype),
+            controls=kept_of.controls,
+            rows=kept_of.rows,
+            turning=tuple(measured.index(i) for i in task.angles if i in measured),
+            rates=kept_of.rates,
+            weight=kept_of.weight,
+            dt=float(task.dt),
+            asked=tuple(asked),
+        )
+        seen, first = [(entry,) for entry in range(layer.size)], (layer,)
+    plain = tuple(entry for i, (entry, *_) in enumerate(seen) if i not in turning)
+    return *first, Features(plain, tuple(seen[i] for i in turning))
 
 
 def _network(settings: MLP, learned: Learned) -> list[Layer]:
     """The layers of the mean of a network: noise on the units is its mean, which the kernels take in."""
     params, dtype = learned.params, learned.dtype
     mean, scale = (_array(value, np.float64) for value in params["input"])
-    units = _units(settings, len(mean), learned)
+    units = 1 / np.broadcast_to(input_scale(learned.task, settings.input_units), mean.shape)
     dense = [params["network"]["params"][f"layer_{i}"] for i in range(len(settings.hidden) + 1)]
     layers: list[Layer] = []
     if np.any(mean != 0) or np.any(scale * units != 1):
@@ -175,14 +178,6 @@ def _network(settings: MLP, learned: Learned) -> list[Layer]:
         kernel = _array(layer["kernel"], np.float64) * (1 - settings.dropout if i else 1)
         layers.append(Dense(kernel.astype(dtype), _array(layer["bias"], dtype), relu=i < len(settings.hidden)))
     return layers
-
-
-def _units(settings: MLP, features: int, learned: Learned) -> np.ndarray:
-    """The unit of each feature; sines and cosines, the last ones, have none."""
-    units = np.concatenate([settings.input_units, np.ones(features - len(settings.input_units))])
-    asked, last = learned.asked, features - 2 * len(learned.task.angles)
-    units[last - len(asked) : last] = asked
-    return units
 
 
 def _array(values: object, dtype: np.dtype | type) -> np.ndarray:

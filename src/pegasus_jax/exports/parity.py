@@ -1,19 +1,21 @@
-"""Whether a file is the policy: its controls beside those of `pegasus_jax.controller`."""
+"""Whether a file is the policy: its controls beside the policy's own."""
 
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from pegasus_jax import memory as recall
 from pegasus_jax.checks import RunError
-from pegasus_jax.exports.learned import Learned, along, function
+from pegasus_jax.exports.learned import Learned, controlling
 from pegasus_jax.runs import store
-from pegasus_jax.runs.controller import Controller
 from pegasus_jax.runs.restore import precision
 from pegasus_jax.task import Task
-from pegasus_jax.tasks import sensed
+from pegasus_jax.tasks import sensed, terms
+from pegasus_jax.types import Array
 
 OBSERVATIONS = 1000  # half of them stored, as far as there are so many
 EPISODE = 20  # observations between two resets of a controller that remembers
@@ -39,41 +41,43 @@ class Parity(NamedTuple):
 def observations(run: Path, task: Task) -> tuple[np.ndarray, int]:
     """Observations [1000, O], the first of which were stored by the run, and how many.
 
-    The others are uniform in the states' own box, widened by half its width on each side.
+    The others are uniform in the states' own box, widened by half its width on each side. What a policy is asked for
+    beside them is not stored: up to twice its size.
     """
     draw = np.random.default_rng(0)
     episodes = [store.load_episode(run, trial) for trial in store.numbered(run / "episodes", ".npz")]
     seen = [np.asarray(episode.trajectory.x, float) for episode in episodes if episode is not None]
     start, std = np.asarray(task.start_mean, float), np.asarray(task.start_std, float)
-    # What the policy is asked for beside x is not among the stored rows.
-    more = [len(start) - rows.shape[1] for rows in seen]
-    seen = [
-        np.concatenate([rows, draw.uniform(-2, 2, (len(rows), m)) * std[len(std) - m :]], 1) if m else rows
-        for rows, m in zip(seen, more, strict=True)
-    ]
     every = np.concatenate([*seen, [start - std, start + std]])
     # One that remembers is given them in their order.
     stored = (every[:-2] if task.memory.names else draw.permutation(every[:-2]))[: OBSERVATIONS // 2]
     low, high = every.min(0), every.max(0)
     margin = (high - low) / 2
     others = draw.uniform(low - margin, high + margin, (OBSERVATIONS - len(stored), len(low)))
-    return sensed.observation(np.concatenate([stored, others]), task), len(stored)
+    given = sensed.observation(np.concatenate([stored, others]), task)
+    units = dict(zip(task.memory.shown, recall.units(task.memory), strict=True))
+    sizes = np.array([units[name] for name in terms.asked_names(task)])
+    return np.concatenate([given, sizes * draw.uniform(-2, 2, (len(given), len(sizes)))], 1), len(stored)
 
 
-def compared(run: Callable[[np.ndarray], np.ndarray], learned: Learned, reference: Controller, folder: Path) -> Parity:
-    """What `run`, the file, makes of observations [N, O] of the run in `folder`, beside `reference`: its `controller`.
+def compared(run: Callable[[np.ndarray], np.ndarray], learned: Learned, folder: Path) -> Parity:
+    """What `run`, the file, makes of observations [N, O] of the run in `folder`, beside what the policy does.
 
     One that remembers is reset every 20 observations. Raises RunError where the difference is more than is allowed.
     """
     task = learned.task
     given, stored = observations(folder, task)
     given = given.astype(learned.dtype)
-    expected, found = policys(learned, reference, given), run(given)
-    if found.shape != expected.shape:
-        raise RunError(f"the file returns controls {[*found.shape]}, the policy {[*expected.shape]}; it was not kept")
+    found, shape = run(given), (len(given), len(task.control_names))
+    if found.shape != shape:
+        raise RunError(f"the file returns controls {[*found.shape]}, the policy {[*shape]}; it was not kept")
+    with precision(learned.config):
+        expected = policys(learned, given, found)
+    with jax.enable_x64(True):
+        exact = policys(learned, given.astype(np.float64), found.astype(np.float64))
     span = np.asarray(task.control_high) - np.asarray(task.control_low)
     difference = np.abs(found.astype(float) - expected) / span
-    rounding = np.abs(expected - exact(learned, given)) / span
+    rounding = np.abs(expected - exact) / span
     parity = Parity(len(given), stored, float(difference.max()), float(rounding.max()))
     if not parity.largest_difference <= parity.allowed:  # NaN is none
         worst = given[int(np.argmax(np.where(np.isnan(difference), np.inf, difference).max(-1)))]
@@ -84,22 +88,20 @@ def compared(run: Callable[[np.ndarray], np.ndarray], learned: Learned, referenc
     return parity
 
 
-def policys(learned: Learned, reference: Controller, given: np.ndarray) -> np.ndarray:
-    """The controls [N, U] of a policy, as its `controller` gives them; of rows that ask for something, as they do."""
-    if learned.asked:
-        with precision(learned.config):
-            return np.asarray(jax.jit(jax.vmap(function(learned)))(given))
-    expected = []
-    for number, x in enumerate(given):
-        if number % EPISODE == 0:
-            reference.reset()
-        expected.append(reference(x))
-    return np.stack(expected)
+def policys(learned: Learned, given: np.ndarray, sent: np.ndarray) -> np.ndarray:
+    """The controls [N, U] of a policy for observations [N, O], each after those that were `sent` [N, U] before.
 
+    Of a policy that sees its past controls a rounding may grow from one to the next: the file is followed.
+    """
+    act = controlling(learned)
 
-def exact(learned: Learned, given: np.ndarray) -> np.ndarray:
-    """The controls [N, U] of a policy in double precision, with the same weights and observations [N, O]."""
-    size = given.shape[-1]
-    with jax.enable_x64(True):
-        episodes = jax.jit(jax.vmap(along(learned)))(given.astype(np.float64).reshape(-1, EPISODE, size))
-    return np.asarray(episodes).reshape(len(given), -1)
+    def episode(observations: Array, sent: Array) -> Array:
+        def step(kept: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+            u, kept = act(row[0], kept, row[1])
+            return kept, u
+
+        begun = jnp.zeros(len(learned.remembered), observations.dtype)
+        return jax.lax.scan(step, begun, (observations, sent))[1]
+
+    rows = [values.reshape(-1, EPISODE, values.shape[-1]) for values in (given, sent)]
+    return np.asarray(jax.jit(jax.vmap(episode))(*rows)).reshape(sent.shape)

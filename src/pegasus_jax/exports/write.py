@@ -14,12 +14,10 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError, brief, choice
 from pegasus_jax.exports import as_c, as_numpy, as_onnx, as_stablehlo
-from pegasus_jax.exports.asked import observed
 from pegasus_jax.exports.contract import contract
 from pegasus_jax.exports.learned import Learned
 from pegasus_jax.exports.parity import compared
 from pegasus_jax.runs import restore
-from pegasus_jax.runs.controller import Controller
 from pegasus_jax.runs.files import write_json, write_whole
 
 
@@ -51,23 +49,21 @@ def export(
 
     `trial` is as in `controller`. `format` is numpy (one module), c (one C99 header), onnx or stablehlo; `out` is the
     file, RUN/controller.py and so on where it is None. Beside it comes OUT.json, its contract: names, units and order
-    of observations and controls, limits, period, versions, and the largest difference from `controller` on 1,000
+    of observations and controls, limits, period, versions, and the largest difference from the policy on 1,000
     observations. Raises RunError where that is more than 1e-5 of the control range beside the rounding of the policy
     itself, or the run has no such trial, and ConfigError for a format or a file that cannot be; then nothing is left.
     """
     choice("format", format, FORMATS)
     made, run = FORMATS[format], Path(run)
     file = destination(run, format, out, overwrite)
-    reference = Controller(run, trial)
-    config, experiment, state = restore.restored(run, reference.trial)
-    name = run.resolve().name
-    task, asked = observed(experiment.task)
-    learned = Learned(name, reference.trial, config, task, experiment.policy, state.policy.params, asked)
+    config, experiment, state = restore.restored(run, trial)
+    name, number = run.resolve().name, int(state.trial)
+    learned = Learned(name, number, config, experiment.task, experiment.policy, state.policy.params)
     data = made.write(learned, file.stem)
     with tempfile.TemporaryDirectory() as folder:
         (unproven := Path(folder) / file.name).write_bytes(data)
-        parity = compared(partial(made.run, unproven), learned, reference, run)
-    words = ["pegasus-export", str(run), f"trial={reference.trial}", f"format={format}", f"out={file}"]
+        parity = compared(partial(made.run, unproven), learned, run)
+    words = ["pegasus-export", str(run), f"trial={number}", f"format={format}", f"out={file}"]
     said = contract(learned, format, file, data, parity, shlex.join(words))
     write_whole(file, lambda opened: opened.write(data))
     write_json(contract_of(file), said)
