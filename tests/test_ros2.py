@@ -99,6 +99,24 @@ def test_limits_and_rest_are_parameters(ros: Any, policy: Path) -> None:
         assert tick(node) == pytest.approx(np.clip(control(x), -0.1, 0.05))
 
 
+def test_it_is_asked_for_a_goal_and_the_time(ros: Any, tmp_path: Path) -> None:
+    """Of a controller that sends what it is given: enabled once there is a goal, and its time begins there."""
+    (tmp_path / "follow.py").write_text("""
+OBSERVATION, CONTROL, PERIOD = ("angle", "t", "goal 0"), ("a", "b", "c"), 0.1
+class Controller:
+    def reset(self): pass
+    def __call__(self, x): return x
+""")
+    ros.given |= {"controller": str(tmp_path / "follow.py"), "observe": ["position.pole", "time", "asked.0"]}
+    node = ros.PolicyNode()
+    read(ros, node, [0.0, 0.0, 0.0, 3.0])
+    assert enable(ros, node).message == "the topic asked has no asked.0"
+    node.subscriptions["asked"](ros.Float64MultiArray(data=[0.5]))
+    for _ in range(2):
+        assert enable(ros, node).success
+        assert [tick(node) for _ in range(3)] == [[3.0, pytest.approx(0.1 * i), 0.5] for i in range(3)]
+
+
 @pytest.mark.parametrize(
     ("spoil", "says"),
     [
@@ -106,7 +124,7 @@ def test_limits_and_rest_are_parameters(ros: Any, policy: Path) -> None:
             lambda ros, node: ros.clock.append(ros.clock.pop() + 0.06),
             "the newest joint states are 0.060 s old, more than 0.05 s",
         ),
-        (lambda ros, node: read(ros, node, [0.0] * 4, ("pole",)), "the joint states have no position of cart"),
+        (lambda ros, node: read(ros, node, [0.0] * 4, ("pole",)), "the topic joint_states has no position.cart"),
         (lambda ros, node: read(ros, node, [np.nan] * 4), "4 finite numbers"),
     ],
 )
@@ -150,7 +168,7 @@ def test_it_ends_at_rest(ros: Any) -> None:
         ({"observe": OBSERVE[:3]}, r"observe has 3 entries; .* observes \('x \[m\]',"),
         (
             {"observe": ["angle.pole"] * 4},
-            "observe has 'angle.pole'; expected position.JOINT, velocity.JOINT or effort",
+            "observe has 'angle.pole'; expected position.JOINT, velocity.JOINT, effort.JOINT, asked.NUMBER or time",
         ),
         ({"low": [0.0, 0.0]}, "low has 2 entries; there are 1 controls"),
     ],

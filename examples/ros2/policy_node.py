@@ -9,6 +9,7 @@ publishes rest, and is disabled until somebody enables it again, where that mess
 what is no number. It begins disabled, says its contract, and then only publishes rest: a dry run.
 """
 
+import re
 import runpy
 import time
 from typing import Any
@@ -24,10 +25,12 @@ PARTS = ("position", "velocity", "effort")
 
 
 class PolicyNode(Node):
-    """Parameters, besides the topics `joint_states` and `commands`, which ROS can remap:
+    """Parameters, besides the topics `joint_states`, `asked` and `commands`, which ROS can remap:
 
     controller: the file of `pegasus-export RUN format=numpy`
-    observe: what each entry of an observation is, as position.elbow or velocity.elbow, in the controller's order
+    observe: what each entry of an observation is, as position.elbow or velocity.elbow, in the controller's order; a
+        goal or a reference is asked.0, asked.1, ..., the newest numbers of the topic `asked`; time is that since it was
+        enabled [s]
     low, high: limits of the controls; left out, those of the controller
     rest: what is published while disabled; left out, zeros
     stale_after: seconds after which a message is too old; 0: three periods
@@ -39,27 +42,27 @@ class PolicyNode(Node):
         module = runpy.run_path(path)
         self.control, self.period = module["Controller"](), float(module["PERIOD"])
         count = len(module["CONTROL"])
-        self.entries = [self._entry(text) for text in self.declare_parameter("observe", [""]).value]
+        self.entries = list(self.declare_parameter("observe", [""]).value)
+        for entry in self.entries:
+            if not re.fullmatch(rf"({'|'.join(PARTS)})\..+|asked\.\d+|time", entry):
+                expected = ", ".join(f"{part}.JOINT" for part in PARTS)
+                raise ValueError(f"observe has {entry!r}; expected {expected}, asked.NUMBER or time")
         if len(self.entries) != len(module["OBSERVATION"]):
             raise ValueError(f"observe has {len(self.entries)} entries; {path} observes {module['OBSERVATION']}")
         self.low, self.high = self._numbers("low", count, -np.inf), self._numbers("high", count, np.inf)
         self.rest = self._numbers("rest", count, 0.0)
         self.stale_after = float(self.declare_parameter("stale_after", 0.0).value) or 3 * self.period
         self.enabled, self.newest, self.came = False, None, 0.0
+        self.asked, self.periods = [], 0  # the newest numbers; periods since it was enabled
         self.publisher = self.create_publisher(Float64MultiArray, "commands", 1)
         self.create_subscription(JointState, "joint_states", self.on_joints, 1)
+        self.create_subscription(Float64MultiArray, "asked", self.on_asked, 1)
         self.create_service(SetBool, "~/enable", self.on_enable)
         self.create_timer(self.period, self.on_period)
         self.get_logger().info(
             f"{path}: {', '.join(module['OBSERVATION'])} -> {', '.join(module['CONTROL'])} every {self.period:g} s;"
             " disabled until ~/enable"
         )
-
-    def _entry(self, text: str) -> tuple[str, str]:
-        part, _, joint = text.partition(".")
-        if part not in PARTS or not joint:
-            raise ValueError(f"observe has {text!r}; expected position.JOINT, velocity.JOINT or effort.JOINT")
-        return part, joint
 
     def _numbers(self, name: str, count: int, default: float) -> np.ndarray:
         """A parameter of one number a control. NaN, as ROS has no empty list of numbers, is the default."""
@@ -71,6 +74,9 @@ class PolicyNode(Node):
     def on_joints(self, message: JointState) -> None:
         self.newest, self.came = message, time.monotonic()
 
+    def on_asked(self, message: Float64MultiArray) -> None:
+        self.asked = message.data
+
     def on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         """Enable or disable; where nothing fresh was read it stays disabled."""
         self.enabled, response.message = False, "disabled"
@@ -78,6 +84,7 @@ class PolicyNode(Node):
             try:
                 self.observation()
                 self.control.reset()
+                self.periods = 0
                 self.enabled, response.message = True, "enabled"
             except ValueError as error:
                 response.message = str(error)
@@ -91,13 +98,16 @@ class PolicyNode(Node):
             raise ValueError("no joint states have come")
         if age > self.stale_after:
             raise ValueError(f"the newest joint states are {age:.3f} s old, more than {self.stale_after:g} s")
-        seen = []
-        for part, joint in self.entries:
-            values: Any = getattr(message, part)
-            if joint not in message.name or list(message.name).index(joint) >= len(values):
-                raise ValueError(f"the joint states have no {part} of {joint}")
-            seen.append(float(values[list(message.name).index(joint)]))
-        return seen
+        read: dict[str, Any] = {"time": self.periods * self.period}
+        read |= {f"asked.{i}": value for i, value in enumerate(self.asked)}
+        for part in PARTS:  # one that is not measured is empty
+            pairs = zip(message.name, getattr(message, part), strict=False)
+            read |= {f"{part}.{joint}": value for joint, value in pairs}
+        for entry in self.entries:
+            if entry not in read:
+                topic = "asked" if entry.startswith("asked.") else "joint_states"
+                raise ValueError(f"the topic {topic} has no {entry}")
+        return [float(read[entry]) for entry in self.entries]
 
     def on_period(self) -> None:
         """Publish a control, or rest."""
@@ -105,6 +115,7 @@ class PolicyNode(Node):
         if self.enabled:
             try:
                 u = np.clip(self.control(self.observation()), self.low, self.high)  # ValueError for what is no number
+                self.periods += 1
             except ValueError as error:
                 self.stop(str(error))
         self.publish(u)
