@@ -30,10 +30,10 @@ def main() -> None:
     write(PAGE, page(FIGURES, RESULTS))
 
 
-def write(path: Path, generated: str) -> None:
+def write(path: Path, generated: str, begin: str = BEGIN) -> None:
     """Replace what is between the markers of a page; the rest is a person's."""
-    before, _, rest = path.read_text().partition(BEGIN)
-    path.write_text(before + BEGIN + generated + END + rest.partition(END)[2])
+    before, _, rest = path.read_text().partition(begin)
+    path.write_text(before + begin + generated + END + rest.partition(END)[2])
 
 
 def readme(out: Path) -> str:
