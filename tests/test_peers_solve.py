@@ -109,7 +109,8 @@ def test_a_table_has_every_seed_and_how_often_our_median_goes_into_theirs(tmp_pa
         (["plants=cartpol"], "plants=cartpol is unknown; did you mean"),
         (["programs=SAC"], "programs=SAC is unknown; choices: pegasus_jax"),
         (["pythn=x"], "pythn= is unknown; did you mean"),
-        (["limit=soon"], "limit=soon is not a number from 0"),
+        (["limit=soon"], "limit=soon is not a whole number"),
+        (["core=1.5"], "core=1.5 is not a whole number"),
         (["mc_pilco=nowhere"], "mc_pilco=nowhere is not a checkout of it"),
         (["programs=prob_mbrl"], "prob_mbrl= is not a checkout of it"),
     ],
@@ -117,6 +118,14 @@ def test_a_table_has_every_seed_and_how_often_our_median_goes_into_theirs(tmp_pa
 def test_what_cannot_be_run_is_one_line(words: list[str], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         solve.asked(words)
+
+
+def test_a_file_of_something_else_is_not_written_over(tmp_path: Path) -> None:
+    file = tmp_path / "mine.json"
+    file.write_text("[1, 2]")
+    with pytest.raises(ConfigError, match=r"mine\.json has no runs of this command"):
+        solve.main(["seeds=0", f"out={file}"])
+    assert file.read_text() == "[1, 2]"
 
 
 def test_programs_without_a_checkout_are_left_out() -> None:

@@ -8,12 +8,12 @@ A plant is solved by the first policy that reaches the plant's bar, which attemp
 cart-pole 90 % of 20 episodes succeed, on Pendulum-v1 the mean return of 10 episodes is -200. What judges is on no
 clock. Everything else is, starting and compiling too. `limit` is one of CPU seconds: others may use the machine.
 
-`python` is the one that has the programs' packages, by default this one: `pip install sbx-rl` for SAC and CrossQ,
+`python` is one that has this package and the programs', by default this one: `pip install sbx-rl` for SAC and CrossQ,
 `pip install torch tqdm joblib` for MC-PILCO and prob_mbrl, which are checkouts of github.com/merlresearch/MC-PILCO and
 github.com/mcgillmrl/prob_mbrl. `of_*.py` say what each program's settings are, and what was adapted.
 
-Runs that the file has are not done again; it is written after each run, and the table is printed. `show` writes the
-table of the stored runs into docs/comparison.md, and draws their picture, peers-solve.png.
+Runs that the file has are not done again, but those that failed; it is written after each run, and the table is
+printed. `show` writes the table of the stored runs into docs/comparison.md, and draws their picture, peers-solve.png.
 """
 
 import json
@@ -36,6 +36,7 @@ from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.study import seed_list
 
 OPTIONS = ("plants", "programs", "seeds", "core", "limit", "python", "mc_pilco", "prob_mbrl", "out")
+NUMBERS = {"core": "1", "limit": "600"}
 CHECKOUTS = {"mc_pilco": "policy_learning/MC_PILCO.py", "prob_mbrl": "prob_mbrl/algorithms/mc_pilco.py"}
 PAGE = Path(__file__).parents[3] / "docs" / "comparison.md"
 BEGIN = "<!-- generated: python -m benchmarks.peers.solve show -->\n"
@@ -50,16 +51,12 @@ def chosen(name: str, text: str | None, known: dict[str, Any]) -> list[str]:
     return names
 
 
-def number(options: dict[str, str], name: str, default: str, most: float) -> float:
-    """A number of the command line. ConfigError for what is none, or not from 0 to `most`."""
+def whole(options: dict[str, str], name: str, default: str) -> int:
+    """A whole number of the command line. ConfigError for anything else."""
     text = options.get(name, default)
-    try:
-        value = float(text)
-    except ValueError:
-        value = -1.0
-    if not 0 <= value <= most:
-        raise ConfigError(f"{name}={text} is not a number from 0 to {most:g}; for example {name}={default}")
-    return value
+    if not text.isdecimal():
+        raise ConfigError(f"{name}={text} is not a whole number from 0 on; for example {name}={default}")
+    return int(text)
 
 
 def asked(words: list[str]) -> tuple[dict[str, str], list[tuple[str, int, str]]]:
@@ -74,8 +71,8 @@ def asked(words: list[str]) -> tuple[dict[str, str], list[tuple[str, int, str]]]
     for name, file in CHECKOUTS.items():
         if name in programs and not (Path(options.get(name, "")) / file).is_file():
             raise ConfigError(f"{name}={options.get(name, '')} is not a checkout of it: there is no {file}")
-    for name, default, most in (("core", "1", 4096), ("limit", "600", 1e6)):
-        number(options, name, default, most)
+    for name, default in NUMBERS.items():
+        whole(options, name, default)
     seeds = seed_list(options.get("seeds", "0-2").strip("[]"))
     plants = chosen("plants", options.get("plants"), PLANTS)
     runs = [(plant, seed, program) for plant in plants for seed in seeds for program in programs]
@@ -84,7 +81,7 @@ def asked(words: list[str]) -> tuple[dict[str, str], list[tuple[str, int, str]]]
 
 def one(plant: str, seed: int, program: str, options: dict[str, str]) -> dict[str, Any]:
     """One run: its policies as they were judged, and the load of the machine when it began."""
-    core, limit = int(options.get("core", "1")), float(options.get("limit", "600"))
+    core, limit = (whole(options, name, default) for name, default in NUMBERS.items())
     python = sys.executable if program == "pegasus_jax" else options.get("python", sys.executable)
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder:
@@ -97,6 +94,16 @@ def one(plant: str, seed: int, program: str, options: dict[str, str]) -> dict[st
     return run | {"solved": solved, "error": error, "policies": rows}
 
 
+def done(out: Path) -> list[dict[str, Any]]:
+    """The runs of a file, if it is there, but those that failed. ConfigError for a file of something else."""
+    try:
+        return [run for run in json.loads(out.read_text())["runs"] if not run["error"]]
+    except FileNotFoundError:
+        return []
+    except (ValueError, KeyError, TypeError):
+        raise ConfigError(f"out={out} has no runs of this command; expected a new file, or one that it wrote") from None
+
+
 def main(words: list[str]) -> None:
     """The command line of this module."""
     out = RESULTS / "peers-solve.json"
@@ -104,22 +111,17 @@ def main(words: list[str]) -> None:
         options, runs = asked(words)
         out = Path(options.get("out", out))
         for plant, seed, program in runs:
-            known = json.loads(out.read_text())["runs"] if out.exists() else []
-            if any((run["plant"], run["seed"], run["program"]) == (plant, seed, program) for run in known):
+            if any((run["plant"], run["seed"], run["program"]) == (plant, seed, program) for run in done(out)):
                 continue
             new = one(plant, seed, program, options)
-            last = new["policies"][-1:] or [None]
-            print(
-                plant, seed, program, "solved" if new["solved"] else "not solved", new["error"] or last[0], flush=True
-            )
-            known = json.loads(out.read_text())["runs"] if out.exists() else []  # another command may add to it
+            said = new["error"] or json.dumps(new["policies"][-1] if new["policies"] else None)
+            print(f"{plant} {program} seed {seed}: {'' if new['solved'] else 'not '}solved, {said}", flush=True)
             told = about(shlex.join(["python", "-m", "benchmarks.peers.solve", *words]))
-            write_json(out, {"runs": [*known, new], "about": told})
-    runs = json.loads(out.read_text())["runs"]
-    print(table(runs))
+            write_json(out, {"runs": [*done(out), new], "about": told})  # another command may have added to it
+    print(table(done(out)))
     if words == ["show"]:
-        picture(runs, out.with_suffix(".png"))
-        write(PAGE, f"\n{table(runs)}\n\n", BEGIN)
+        picture(done(out), out.with_suffix(".png"))
+        write(PAGE, f"\n{table(done(out))}\n\n", BEGIN)
 
 
 if __name__ == "__main__":
