@@ -2,7 +2,7 @@
 
 What is adapted: the cart-pole's observation has the sine and the cosine of the angle in place of it, as the
 environments have with which such programs are tried; the reward is the environment's. A policy is judged every
-`EVERY` seconds of plant time, without its noise.
+`EVERY` seconds of plant time, without its noise. On one core a step of CrossQ took 80 to 100 ms, one of SAC 9.
 """
 
 from typing import Any
