@@ -1,6 +1,6 @@
 """A learning study whose search knows the task's cost as one of a user's: neither its expectation nor its width.
 
-    python -m benchmarks.own_cost NAME seeds=0-49 task=cartpole model=log_normal trials=15 search.cost_width_start=1
+    python -m benchmarks.own_cost NAME seeds=0-49 task=cartpole model=log_normal trials=15
 
 Words and file as in benchmarks.study; `search.cost_estimator=particles` follows the cost of each particle.
 """

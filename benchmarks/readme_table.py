@@ -35,12 +35,12 @@ class Row(NamedTuple):
 
 
 ROWS = (
-    Row("cart-pole", "cartpole", ("cartpole-default", "cartpole-default-70", "cartpole-default-120")),
-    Row("cart-pole, the paper's network", "cartpole_network", ("cartpole-log_normal",)),
+    Row("cart-pole", "cartpole", ("cartpole-rounds",)),
+    Row("cart-pole, the paper's network", "cartpole_network", ("cartpole_network-rounds",)),
     Row(
         "cart-pole as your own plant: any cost, network",
         "cartpole_network",
-        ("cartpole-own_cost-nodes", "cartpole-own_cost-nodes-50"),
+        ("cartpole-own_cost-rounds",),
         own_cost,
     ),
     Row("double cart-pole, on a GPU", "double_cartpole_gpu", ("double_cartpole-reheated",)),
@@ -48,7 +48,7 @@ ROWS = (
     Row(
         "swimmer, knife edge",
         "swimmer_knife_edge",
-        ("swimmer_knife_edge-16", "swimmer_knife_edge-16-10", "swimmer_knife_edge-16-20"),
+        ("swimmer_knife_edge-rounds",),
     ),
     Row("swimmer, belly up", "swimmer_belly_up", ("swimmer-belly_up",)),
     Row("swimmer, corkscrew", "swimmer_corkscrew", ("swimmer-corkscrew",)),

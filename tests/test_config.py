@@ -39,7 +39,7 @@ def test_the_defaults_are_the_measured_ones():
     assert (c.search.matching, c.search.standardized_noise) == ("always", False)
     assert c.search.period == Period(start=1, dynamics=100, policy=1, sensor=1, match=1)
     assert (c.model.activation, c.model.kl_weight, c.search.init) == ("silu", 0.1, "better")
-    assert (c.search.cost_estimator, c.search.cost_width_start) == ("gaussian", 4.0)  # docs/decisions.md 0002
+    assert (c.search.cost_estimator, c.search.cost_width_start) == ("gaussian", None)  # docs/decisions.md 0002, 0033
     assert (c.explore.trials, c.explore.kind) == (1, "uniform")
 
 

@@ -8,8 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pegasus_jax.assembly.schedules import rounds_from, width_for
 from pegasus_jax.imagine.objective import either
-from pegasus_jax.learn.schedule import COARSE, CURRENT, EVALUATE, FRESH, START, STEP, first_rows, search_table
+from pegasus_jax.learn.schedule import (
+    COARSE,
+    CURRENT,
+    EVALUATE,
+    FRESH,
+    START,
+    STEP,
+    first_rows,
+    search_table,
+)
 from pegasus_jax.viz.search_table import text
 
 
@@ -66,12 +76,34 @@ def test_the_width_narrows_geometrically_and_stays():
     np.testing.assert_allclose(of_steps(refining.cost_width, refining)[0, [0, 5, 10, 15]], [4, 2, 1, 1])
 
 
+def test_a_cost_begins_as_wide_as_makes_it_nine_tenths_where_episodes_start():
+    """Of 1 - exp(-e^2 / 2): with the width w it is 1 - exp(-e^2 / 2 w^2)."""
+    for error in (3.0, 4.8):
+        width = width_for(1 - np.exp(-0.5 * np.full(7, error) ** 2))
+        np.testing.assert_allclose(1 - np.exp(-0.5 * (error / width) ** 2), 0.9, rtol=1e-9)
+    assert width_for(np.array([0.0, 1.0])) == width_for(np.array([0.9])) == 1
+    assert 2.6 < width_for(np.ones(3)) < 2.7  # what single precision cannot tell from 1
+    assert width_for(np.array([7.0])) == width_for(np.ones(3))  # a cost that is not within [0, 1]
+
+
 def test_the_step_size_falls_and_begins_again_where_a_search_refines():
     table = search_table(100, decay=0.2, refine=60)
     sizes = of_steps(table.step_size, table)[0]
     np.testing.assert_allclose(sizes[[0, 30, 59]], [1, 0.6, 0.2], atol=1e-3)
     np.testing.assert_allclose(sizes[[60, 80, 99]], [1, 0.515, 0.03], atol=2e-3)
     np.testing.assert_allclose(search_table(100, decay=0.2).step_size[0, [0, 50, 99]], [1, 0.6, 0.2], atol=1e-3)
+
+
+def test_a_refinement_has_rounds_that_begin_at_the_full_step_size_and_may_each_be_the_last():
+    table = search_table(500, refine=rounds_from(300, 500, 4))
+    sizes = of_steps(table.step_size, table)[0, 300:].reshape(4, 50)
+    np.testing.assert_allclose(sizes, np.tile(search_table(50, refine=0).step_size[0, :50], (4, 1)), atol=1e-6)
+    assert table.iteration[table.ends].tolist() == [349, 399, 449, 499]
+    assert of_steps(table.counts, table)[300:].reshape(4, 50).sum(1).tolist() == [12] * 4
+    assert not of_steps(table.counts, table)[:300].any()
+    assert table.refine[table.iteration >= 300].all()
+    assert rounds_from(380, 500, 4) == [380, 440]  # a round has 50 iterations at least
+    assert rounds_from(470, 500, 4) == [470]
 
 
 def test_annealed_searches_are_one_and_the_last_row_of_factors_serves_all_later_ones():
@@ -98,8 +130,8 @@ def test_a_table_can_be_read_without_jax():
         "print(text(search_table(2, init='better', refine=1, cost_width_start=2))); assert 'jax' not in sys.modules"
     )
     lines = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.splitlines()
-    assert lines[0].split() == ["iteration", "scenarios", "action", "candidate", "refine", "width", "step", "limit"]
-    assert lines[1].split() == ["0", "0", "evaluate", "current", "no", "2.000", "1.000", "1"]
+    assert " ".join(lines[0].split()) == "iteration scenarios action candidate refine ends width step limit"
+    assert lines[1].split() == ["0", "0", "evaluate", "current", "no", "no", "2.000", "1.000", "1"]
     assert [line.split()[2:4] for line in lines[2:]] == [
         ["evaluate", "fresh"],
         ["step", "current"],

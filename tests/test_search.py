@@ -1,6 +1,7 @@
 """Policy search: the objective against closed forms and finite differences, the optimizer against a loop."""
 
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +17,7 @@ from pegasus_jax.imagine.objective import objective
 from pegasus_jax.imagine.rollout import NoiseUse
 from pegasus_jax.imagine.scenarios import Sampler, sampler
 from pegasus_jax.learn.gradient import gradient_search
+from pegasus_jax.learn.rounds import after_row, unrefined
 from pegasus_jax.learn.schedule import SearchTable, search_table
 from pegasus_jax.learn.search import Problem, searcher
 from pegasus_jax.types import Cost, Period, Scenarios, TrainState
@@ -335,6 +337,42 @@ def test_a_search_that_only_refines_is_the_last_part_of_a_whole_one(calls):
     _, info = run(jax.random.key(7), on_table(table, optimizer)[1], 1.0, first=0, only_refines=False)
     assert info.iterations == 6 // calls
     assert run._cache_size() == 1
+
+
+@pytest.mark.parametrize("calls", [1, 5])
+@pytest.mark.parametrize(("slope", "iterations"), [(1.0, 200), (0.0, 100)])
+def test_a_refinement_ends_with_the_round_that_has_gained_nothing(slope, iterations, calls):
+    """A cost that falls with every step is followed to the end; one that is noise alone is left after two rounds."""
+    table = search_table(200, refine=range(0, 200, 50))
+    noise = lambda key, step, _: jnp.where(step // 50 == 0, 1.0, 1.2) + 0.1 * (step % 2)  # noqa: E731
+    value = lambda params, posterior, level, row: slope * params.sum() + level  # noqa: E731
+    found, learner = on_table(table, optax.sgd(0.1), noise, value)
+    run, infos = jax.jit(partial(found.run, steps=200 // calls)), []
+    for call in range(calls):
+        learner, info = run(jax.random.key(7), learner, 1.0, first=call * (200 // calls))
+        infos.append(info)
+    objective = np.concatenate([info.objective for info in infos])
+    assert sum(int(info.iterations) for info in infos) == np.isfinite(objective).sum() == iterations
+    assert np.isfinite(objective[:iterations]).all()
+    _, info = run(jax.random.key(7), learner, 1.0, first=0)  # the next search begins again
+    assert info.iterations == min(100 if slope == 0 else 200, 200 // calls)
+
+
+def test_a_round_has_gained_what_lowers_the_mean_by_more_than_the_standard_error():
+    def judged(before, now):
+        """Whether a search is over after two rounds with these objectives."""
+        progress = unrefined()
+        for values in (before, now):
+            for i, value in enumerate(values):
+                row = SimpleNamespace(counts=jnp.bool_(True), ends=jnp.bool_(i == len(values) - 1))
+                progress = after_row(progress, row, jnp.float32(value))
+        return bool(progress.over)
+
+    before = np.array([1.0, 1.2, 0.8, 1.1, 0.9])
+    error = np.sqrt(2 * np.var(before, ddof=1) / 5)
+    assert judged(before, before - 0.95 * error)
+    assert not judged(before, before - 1.05 * error)
+    assert judged(before, before + 1)
 
 
 def test_each_iteration_has_its_width_wherever_the_search_is_cut():

@@ -20,7 +20,7 @@ def parse(*words):
 
 
 # What the cart-pole's words begin with: all defaults but those of its search.
-CARTPOLE = Config(search=Search(standardized_noise=True, cost_width_start=2.0, refine_fraction=0.5))
+CARTPOLE = Config(search=Search(standardized_noise=True, refine_fraction=0.5))
 
 
 def value(chosen, key):
@@ -62,6 +62,8 @@ SPELLINGS = [
     ("search.grad_clip=0.5", "search.grad_clip", 0.5),
     ("search.grad_clip=null", "search.grad_clip", None),
     ("search.matching=never", "search.matching", "never"),
+    ("search.cost_width_start=2", "search.cost_width_start", 2.0),
+    ("search.cost_width_start=null", "search.cost_width_start", None),
     ("search.standardized_noise=true", "search.standardized_noise", True),
     ("search.cost_estimator=particles", "search.cost_estimator", "particles"),
     ("search.init=fresh", "search.init", "fresh"),
@@ -176,12 +178,12 @@ def test_a_variant_brings_defaults_that_single_settings_change():
 
 
 @pytest.mark.parametrize("words", [("task=gym", "env=Pendulum-v1"), ("task=mjcf", "mjcf=arm.xml")])
-def test_a_cost_of_ones_own_is_matched_and_not_widened(words):
-    """docs/decisions.md 0018; the paper's search follows each particle's, on every task."""
+def test_a_cost_of_ones_own_is_matched_and_as_wide_as_its_starts_need(words):
+    """docs/decisions.md 0018 and 0033; the paper's search follows each particle's, on every task."""
     chosen = parse(*words, "cost=mine:cost", "dt=0.1", "horizon=9").search
     assert (chosen.cost_estimator, chosen.cost_width_start, chosen.standardized_noise, chosen.refine_fraction) == (
         "gaussian",
-        1,
+        None,
         True,
         0.5,
     )

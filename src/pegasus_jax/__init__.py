@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from pegasus_jax.learn.fit import minibatches as minibatches
     from pegasus_jax.learn.gradient import SearchInfo as SearchInfo
     from pegasus_jax.learn.gradient import gradient_search as gradient_search
+    from pegasus_jax.learn.rounds import Progress as Progress
     from pegasus_jax.learn.schedule import SearchTable as SearchTable
     from pegasus_jax.learn.schedule import search_table as search_table
     from pegasus_jax.learn.search import Problem as Problem
@@ -108,6 +109,7 @@ _NAMES = {
     "imagine.objective": "objective",
     "learn.gradient": "gradient_search SearchInfo",
     "learn.search": "search searcher Problem SearchState",
+    "learn.rounds": "Progress",
     "learn.schedule": "search_table SearchTable",
     # models and policies
     "models.bnn": "bnn",

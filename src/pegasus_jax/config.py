@@ -105,8 +105,10 @@ class Search:
         "last part of a search, as a fraction, which refines the better of the new policy and the old one;"
         " after an episode that succeeded the only part",
     )
-    cost_width_start: float = setting(
-        4.0, "the cost's width at the start of a search, as a factor; back to 1 by half of it"
+    cost_width_start: float | None = setting(
+        None,
+        "the cost's width at the start of a search, as a factor; back to 1 by half of it. null: what lets it fall"
+        " where episodes start, 1 where it does so already",
     )
     anneal_trials: int = setting(1, "trials over which cost_width_start= and decay= run down once; 1: in every search")
     particle_grad_limit: float | None = setting(
@@ -138,7 +140,8 @@ class Search:
         checks.typed("search", self)
         checks.kind("search", self.kind, "particles")
         checks.check_minimum("search", self, 0, "policy_noise", "state_noise")
-        checks.check_minimum("search", self, 1, "cost_width_start", "warm_limit_factor")
+        wide = () if self.cost_width_start is None else ("cost_width_start",)
+        checks.check_minimum("search", self, 1, "warm_limit_factor", *wide)
         checks.sizes("search", self, "steps", "anneal_trials", "num_starts")
         checks.sizes("search", self, "particles", low=2)
         checks.check_range("search.learning_rate", self.learning_rate, 0, open_low=True)

@@ -38,7 +38,7 @@ CARTPOLE = Config(
     model=Lagrangian(substeps=_SUBSTEPS["cartpole"]),
     fit=Fit(steps=3000, learning_rate=3e-3),
     # docs/decisions.md 0014, 0015 and 0029.
-    search=Search(particles=50, cost_width_start=2.0, standardized_noise=True, refine_fraction=0.5),
+    search=Search(particles=50, standardized_noise=True, refine_fraction=0.5),
 )
 
 # docs/decisions.md 0006, 0008, 0009 and 0011.
@@ -54,6 +54,7 @@ DOUBLE_CARTPOLE = Config(
         decay=0.03,
         matching="never",
         cost_estimator="particles",
+        cost_width_start=4.0,
         anneal_trials=14,
         warm_restart=0.17,
         particle_grad_limit=1.0,
@@ -69,7 +70,7 @@ DOUBLE_CARTPOLE_NETWORK = Config(
     trials=40,
     model=BNN(hidden=(200,) * 4),
     policy=MLP(hidden=(50,) * 4, dropout=0.1),
-    search=Search(learning_rate=1e-4),
+    search=Search(learning_rate=1e-4, cost_width_start=4.0),
     explore=Explore(trials=2),
 )
 
@@ -96,11 +97,9 @@ def swimmer(maneuver: str, legs: int) -> Config:
     )
 
 
-# A cost of one's own is not widened: docs/decisions.md 0031. Its expectation is a mean over nodes: 0018. Such a plant
-# may start anywhere: 0024. It is to hold for longer than an episode: 0023.
-_OWN_PLANT = Search(
-    cost_width_start=1.0, standardized_noise=True, refine_fraction=0.5, matching="narrow", visited_starts=0.5
-)
+# The expectation of a cost of one's own is a mean over nodes: docs/decisions.md 0018. Such a plant may start anywhere:
+# 0024. It is to hold for longer than an episode: 0023.
+_OWN_PLANT = Search(standardized_noise=True, refine_fraction=0.5, matching="narrow", visited_starts=0.5)
 
 _SWIMMERS = {
     **{f"swimmer_{name}": swimmer(name, 2) for name in MANEUVERS},

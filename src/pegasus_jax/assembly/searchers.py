@@ -1,7 +1,7 @@
 """How a search's settings become a searcher, and fresh imagined rollouts of the same kind."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -9,6 +9,7 @@ import optax
 
 from pegasus_jax import config as settings
 from pegasus_jax import tasks
+from pegasus_jax.assembly.schedules import first_refining, table_of, width_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import limits as limited
@@ -36,6 +37,7 @@ from pegasus_jax.types import (
     PolicyOptimizer,
     Rollout,
     Scenarios,
+    TrainState,
 )
 
 
@@ -107,12 +109,15 @@ def search_of(
         pieces["dynamics"] = limited.held(dynamics, limited.over(constraint, task.stop))
     match = matching_of(search, task).particles(task.angles)
     costs = costs_of(search, task)
-    table = table_of(search)
-    # What no row asks for is not compiled.
-    refines, widens = table.refine.any(), (table.cost_width != 1).any()
+    refines = first_refining(search) < search.steps
+
+    @cache
+    def table() -> SearchTable:
+        return table_of(search, width_of(search, task))
 
     def value(params: Params, posterior: Params, given: Scenarios, row: SearchTable, *weight: Array) -> Any:
-        refining = row.refine if refines else None
+        # What no row asks for is not compiled.
+        refining, widens = row.refine if refines else None, (table().cost_width != 1).any()
         given = started(given, row.refine) if search.visited_starts else given
         return objective_of(
             params,
@@ -128,7 +133,8 @@ def search_of(
     clip = optax.identity() if search.grad_clip is None else optax.clip_by_global_norm(search.grad_clip)
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
     draws = scenarios.sampler(searched, Period(**vars(search.period)))
-    found = searcher(Problem(value, draws, optimizer, table, reset_optimizer=search.reset_optimizer, ascend=ascend))
+    more: dict[str, Any] = dict(reset_optimizer=search.reset_optimizer, ascend=ascend)
+    found = tabled(table, lambda rows: searcher(Problem(value, draws, optimizer, rows, **more)))
     if search.num_starts > 1:
         lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
         # What refines may end with another than its last.
@@ -149,23 +155,18 @@ def matching_of(search: settings.Search, task: Task) -> Matching:
     return MATCHINGS[search.matching] if task.memory.matched and task.constraint is None else UNMATCHED
 
 
-def table_of(search: settings.Search) -> SearchTable:
-    """What the configured search does, visit by visit."""
-    return search_table(
-        search.steps,
-        init="previous" if search.num_starts > 1 else search.init,  # of several, others are fresh
-        refine=round((1 - search.refine_fraction) * search.steps) if search.refine_fraction else None,
-        cost_width_start=search.cost_width_start,
-        decay=search.decay,
-        anneal_trials=search.anneal_trials,
-        warm_restart=search.warm_restart,
-        warm_limit_factor=search.warm_limit_factor,
-    )
+def tabled(table: Callable[[], SearchTable], searches: Callable[[SearchTable], PolicyOptimizer]) -> PolicyOptimizer:
+    """The searcher of a table that is made when a search needs it: a controller alone has no cost to look at."""
+
+    def run(*given: Any, **where: Any) -> tuple[TrainState, Any]:
+        return searches(table()).run(*given, **where)
+
+    return PolicyOptimizer(searches(search_table(1)).init, run)
 
 
 def refines_successes(search: settings.Search | settings.Analytic) -> bool:
     """Whether the search after an episode that succeeded only refines: several policies need all of it."""
-    return isinstance(search, settings.Search) and search.num_starts == 1 and bool(table_of(search).refine.any())
+    return isinstance(search, settings.Search) and search.num_starts == 1 and first_refining(search) < search.steps
 
 
 def analytic_search_of(

@@ -1,7 +1,7 @@
 """Costs of states, and what a search makes of the costs of K imagined rollouts."""
 
 from collections.abc import Callable
-from functools import lru_cache, wraps
+from functools import lru_cache, partial, wraps
 
 import jax
 import jax.numpy as jnp
@@ -124,10 +124,15 @@ def normal_nodes(count: int, size: int) -> np.ndarray:
     return np.linalg.solve(np.linalg.cholesky(z.T @ z / count), z.T).T
 
 
+def of(cost: Cost, x: Array) -> Array:
+    """The cost [] of one state. Raises ValueError where it is no scalar."""
+    return _scalar(cost.of_state(x))
+
+
 def of_particles(cost: Cost) -> Callable[[Array], Array]:
     """The cost of every particle: x [H, K, D] -> [H, K]. Raises ValueError where a state's cost is no scalar."""
 
-    return jax.vmap(jax.vmap(lambda x: _scalar(cost.of_state(x))))
+    return jax.vmap(jax.vmap(partial(of, cost)))
 
 
 def of_particles_mean(cost: Cost) -> Callable[[Array], Array]:

@@ -1,5 +1,6 @@
 """What a policy search does, written down before it begins: a table in NumPy, one row a visit of the objective."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,7 +10,8 @@ from pegasus_jax.config import INITS
 
 EVALUATE, STEP = range(2)  # what a row does with the candidate whose cost and gradient it computes
 CURRENT, FRESH, START, COARSE = range(4)  # which parameters it visits: see `SearchTable.candidate`
-REFINED = 0.03  # the step size at the end of a refinement, as a fraction of the search's
+REFINED = 0.03  # the step size at the end of a round of refinement, as a fraction of the search's
+JUDGED = 0.25  # the last part of a round, in which the steps are small, whose objectives say what it has gained
 
 
 class SearchTable(NamedTuple):
@@ -26,6 +28,8 @@ class SearchTable(NamedTuple):
     # what the refinement started from. The last two are also taken where a cost is NaN; FRESH is not.
     candidate: Any
     refine: Any  # [R] whether the objective is the refining one
+    counts: Any  # [R] whether a step's objective counts in the mean of its round of refinement
+    ends: Any  # [R] whether a round of refinement ends with the row: the search is over if it has gained nothing
     cost_width: Any  # [T, R] factor of the cost's width
     step_size: Any  # [T, R] factor of the optimizer's update
     limit: Any  # [T, R] factor of the limit on a particle's gradient
@@ -35,7 +39,7 @@ def search_table(
     steps: int,
     *,
     init: str = "previous",
-    refine: int | None = None,
+    refine: int | Sequence[int] | None = None,
     cost_width_start: float = 1.0,
     decay: float = 1.0,
     anneal_trials: int = 1,
@@ -45,7 +49,8 @@ def search_table(
     """The table of searches of `steps` iterations each.
 
     init: what a search starts from: the `previous` policy, a `fresh` one, or the `better` of both; else a ConfigError.
-    refine: the iteration from which it refines the better of what it found and what it was given; None: never.
+    refine: the iteration from which it refines the better of what it found and what it was given, or those with which
+    rounds of that begin, each of which may be the last (learn/rounds.py); None: never.
     cost_width_start: the cost's width at the start; it falls to 1, geometrically, by half of the coarse iterations.
     decay: the step size at the end of the coarse iterations, which falls from 1 as half a cosine.
     anneal_trials: searches over which width and step size fall once.
@@ -54,24 +59,25 @@ def search_table(
     """
     choice("init", init, INITS)
     rows = [(0, 0, EVALUATE, CURRENT), (0, 0, EVALUATE, FRESH)] if init == "better" else []
+    bounds = [] if refine is None else sorted({*np.atleast_1d(refine).tolist(), steps})
     for i in range(steps):
         rows += [(i, i, STEP, FRESH if init == "fresh" and i == 0 else CURRENT)]
-        if refine is not None and i + 1 in (refine, steps):
-            given = START if i + 1 == refine else COARSE
+        if i + 1 in bounds:
+            given = START if i + 1 == bounds[0] else COARSE
             rows += [(i, i + 1, EVALUATE, CURRENT), (i, i + 1, EVALUATE, given)]
     iteration, scenarios, action, candidate = np.array(rows, np.int32).reshape(-1, 4).T
     number = np.arange(anneal_trials + 1 if anneal_trials > 1 else 1)[:, None]
     i = number * steps + scenarios  # [T, R] counted over all searches
-    coarse = anneal_trials * steps if refine is None else refine
+    coarse = bounds[0] if bounds else anneal_trials * steps
     width = cost_width_start ** np.maximum(0, 1 - i / (coarse / 2)) if coarse else np.ones(i.shape)
-    step_size = half_cosine(i / max(coarse, 1), decay)
-    if refine is not None:
-        step_size = np.where(i < refine, step_size, half_cosine((i - refine) / max(steps - refine, 1), REFINED))
+    refines = scenarios >= (bounds[0] if bounds else steps + 1)
+    passed = np.interp(scenarios, bounds or [0], range(len(bounds) or 1)) % 1  # [R] of a round
     annealed = (number < anneal_trials) | (warm_restart == 0)
+    step_size = np.where(refines, half_cosine(passed, REFINED), half_cosine(i / max(coarse, 1), decay))
     step_size = np.where(annealed, step_size, warm_restart * half_cosine(scenarios / max(steps, 1), decay))
     limit = np.where(annealed, np.ones(i.shape), warm_limit_factor)
-    refines = np.zeros(len(rows), bool) if refine is None else scenarios >= refine
-    return SearchTable(iteration, scenarios, action, candidate, refines, width, step_size, limit)
+    counts, ends = refines & (action == STEP) & (passed >= 1 - JUDGED), (candidate == COARSE) & (action == EVALUATE)
+    return SearchTable(iteration, scenarios, action, candidate, refines, counts, ends, width, step_size, limit)
 
 
 def half_cosine(fraction: Any, decay: float) -> np.ndarray:

@@ -11,8 +11,9 @@ import optax
 
 from pegasus_jax.imagine.scenarios import Sampler
 from pegasus_jax.learn.gradient import SearchInfo
+from pegasus_jax.learn.rounds import Progress, unrefined
 from pegasus_jax.learn.schedule import FRESH, STEP, SearchTable, first_rows
-from pegasus_jax.learn.visits import Ascend, after, begun, valued
+from pegasus_jax.learn.visits import Ascend, after, begun, of_search, valued
 from pegasus_jax.types import Array, Key, Params, PolicyOptimizer, TrainState
 
 
@@ -23,6 +24,7 @@ class SearchState(NamedTuple):
     start: Params  # what the search, or its refinement, started from
     last: Array  # [] the objective at the row before
     no_improvement: Array  # [] whether the last search found nothing better than what it was given, before it refined
+    progress: Progress  # of the rounds of its refinement
     multiplier: Any = None  # [] of a constraint's penalty, kept from search to search; None: there is no constraint
 
 
@@ -44,7 +46,7 @@ def searcher(problem: Problem) -> PolicyOptimizer:
     """The searcher of a problem: its `run` is `search`, its learner's optimizer a `SearchState`."""
 
     def init(params: Params) -> SearchState:
-        none = jnp.asarray(jnp.inf, float), jnp.zeros((), bool), begun(problem.ascend)
+        none = jnp.asarray(jnp.inf, float), jnp.zeros((), bool), unrefined(), begun(problem.ascend)
         return SearchState(problem.optimizer.init(params), params, *none)
 
     def run(*given: Any, only_refines: Array | bool = False, **where: Any) -> tuple[TrainState, SearchInfo]:
@@ -66,10 +68,10 @@ def search(
 ) -> tuple[TrainState, SearchInfo]:
     """The rows of iterations first .. first + steps - 1 of the problem's table, in the search after `earlier` others.
 
-    A search that only refines begins at the first that does, as 0; those that it lacks are NaN in the info. One call
-    of n steps and two of n/2, the second with first=n/2, do the same; the info is [n]. `fresh` is a policy that the
-    table may ask for. All rows visit one objective: a second one would take as long again to compile. Raises ValueError
-    for more iterations than the table has, and where its fresh policy is missing.
+    A search that only refines begins at the first that does, as 0, and one ends with a round of refinement that has
+    gained nothing (learn/rounds.py); what it lacks is NaN in the info [n]. One call of n steps and two of n/2, the
+    second with first=n/2, do the same. `fresh` is a policy that the table may ask for. All rows visit one objective:
+    two take twice as long to compile. Raises ValueError for more iterations than the table has, or no fresh policy.
     """
     table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)
     if steps > (most := len(begin) - 1):
@@ -82,30 +84,27 @@ def search(
     row, end = (jnp.asarray(begin)[jnp.minimum(i, most)] for i in (offset, offset + steps))
     count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
 
-    def visit(k: Array, loop: tuple) -> tuple:
-        learner, scenarios, info = loop
+    def going(loop: tuple) -> Array:
+        return (loop[0] < count) & ~loop[1].optimizer.progress.over if table.ends.any() else loop[0] < count
+
+    def visit(loop: tuple) -> tuple:
+        k, learner, scenarios, info = loop
         now: SearchTable = jax.tree.map(lambda column: column[row + k], rows)
-        (own, state), choose = learner, partial(jax.lax.select_n, now.candidate)
+        (own, state), choose, i = learner, partial(jax.lax.select_n, now.candidate), now.iteration - offset
         visited = jax.tree.map(choose, own, fresh if asks else own, state.start, state.start)
         value, gradient, weight = valued(problem, state.multiplier, visited, posterior, scenarios, now)
         learner, cost, skipped = after(now, learner, visited, value, gradient, weight, problem)
-        i = now.iteration - offset
-        stepped = jnp.where(now.action == STEP, i, steps)
-        norms = info.gradient_norm.at[stepped].set(optax.tree.norm(gradient), mode="drop")
+        norm, stepped = optax.tree.norm(gradient), jnp.where(now.action == STEP, i, steps)
         scenarios = sampler.redraw(key, following[row + k], scenarios, posterior)
-        return learner, scenarios, SearchInfo(info.objective.at[i].set(cost), norms, info.skipped + skipped)
+        norms = info.gradient_norm.at[stepped].set(norm, mode="drop")
+        found = SearchInfo(info.objective.at[i].set(cost), norms, info.skipped + skipped, i + 1)
+        return k + 1, learner, scenarios, found
 
     params, state = learner
     optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
-    begins, new = jnp.asarray(first) == 0, state._replace(optimizer=optimizer, start=params)
-    learner = TrainState(params, optax.tree.where(begins, new, state))
+    new = state._replace(optimizer=optimizer, start=params, progress=unrefined())
+    learner = TrainState(params, optax.tree.where(jnp.asarray(first) == 0, new, state))
     scenarios, none = sampler.draw(key, jnp.asarray(offset, jnp.int32), posterior), jnp.full(steps, jnp.nan)
-    learner, _, info = jax.lax.fori_loop(0, count, visit, (learner, scenarios, SearchInfo(none, none, jnp.int32(0))))
-    return learner, info._replace(iterations=jnp.clip(most - offset, 0, steps))
-
-
-def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
-    """The table [R] of the search after `earlier` others. Its numbers are data: no search compiles another program."""
-    # Where all are alike there is no choice to make: of searches vmapped over `earlier` each would have its own.
-    number = jnp.minimum(earlier, most) if (most := len(table.limit) - 1) else 0
-    return SearchTable(*map(jnp.asarray, table[:-3]), *(jnp.asarray(column)[number] for column in table[-3:]))
+    begun = jnp.int32(0), learner, scenarios, SearchInfo(none, none, jnp.int32(0), jnp.int32(0))
+    _, learner, _, info = jax.lax.while_loop(going, visit, begun)
+    return learner, info

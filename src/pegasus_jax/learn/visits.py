@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import optax
 
 from pegasus_jax.imagine.limits import FIRST
+from pegasus_jax.learn.rounds import after_row
 from pegasus_jax.learn.schedule import START, STEP, SearchTable
 from pegasus_jax.learn.updates import is_finite, update_if
 from pegasus_jax.types import Array, Params, TrainState
@@ -53,9 +54,17 @@ def after(
         optimizer=moved,
         start=optax.tree.where(row.candidate >= START, params, state.start),
         last=value,
+        progress=after_row(state.progress, row, value),
         no_improvement=jnp.where(row.candidate == START, taken, state.no_improvement),
         # After a step only: what rows compare is weighed alike.
         multiplier=None if multiplier is None else jnp.where(steps_now, multiplier, state.multiplier),
     )
     params = optax.apply_updates(params, optax.tree.scale(row.step_size, updates))
     return TrainState(params, found), jnp.where(taken, value, state.last), steps_now & ~finite
+
+
+def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
+    """The table [R] of the search after `earlier` others. Its numbers are data: no search compiles another program."""
+    # Where all are alike there is no choice to make: of searches vmapped over `earlier` each would have its own.
+    number = jnp.minimum(earlier, most) if (most := len(table.limit) - 1) else 0
+    return SearchTable(*map(jnp.asarray, table[:-3]), *(jnp.asarray(column)[number] for column in table[-3:]))

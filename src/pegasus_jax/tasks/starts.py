@@ -22,6 +22,16 @@ def start(key: Key, *, task: Task) -> Array:
     return mean + std * jax.random.normal(key, mean.shape)
 
 
+def examples(task: Task, count: int) -> np.ndarray:
+    """First states [count, D] of the task, always the same. In NumPy: nothing is compiled for them."""
+    draws = np.random.default_rng(0)
+    mean, std = np.asarray(task.start_mean, float), np.asarray(task.start_std, float)
+    if task.starts is None:
+        return mean + std * draws.normal(size=(count, len(mean)))
+    places = np.asarray(task.starts, float)[draws.integers(len(task.starts), size=count)]
+    return places if task.starts_std is None else places + task.starts_std * draws.normal(size=places.shape)
+
+
 def from_starts(task: Task, starts: tuple[tuple[float, ...], ...]) -> Task:
     """The task whose plant in JAX starts around these states, equally likely, with the spread that its starts have.
 

@@ -1,0 +1,67 @@
+"""Which table the settings of a search and the starts of a task ask for."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from pegasus_jax import config as settings
+from pegasus_jax.imagine import costs
+from pegasus_jax.learn.schedule import SearchTable, search_table
+from pegasus_jax.memory import begin, join
+from pegasus_jax.task import Task
+from pegasus_jax.tasks.starts import examples
+from pegasus_jax.types import Array, Key
+
+STARTS = 256  # at which the cost is looked at
+SEEN = 0.9  # a greater cost is too flat to be followed: docs/decisions.md 0033
+LEAST_REST = 1e-7  # of 1 - cost: less is rounding in single precision
+ROUNDS, SHORTEST_ROUND = 4, 50  # of a refinement, at most, and its iterations, at least: docs/decisions.md 0032
+
+
+def table_of(search: settings.Search, width: float) -> SearchTable:
+    """What the configured search does, visit by visit, where the cost begins `width` times as wide."""
+    first = first_refining(search)
+    most = ROUNDS if search.num_starts == 1 else 1  # of policies side by side none ends before the others
+    return search_table(
+        search.steps,
+        init="previous" if search.num_starts > 1 else search.init,  # of several, others are fresh
+        refine=rounds_from(first, search.steps, most) if search.refine_fraction else None,
+        cost_width_start=width,
+        decay=search.decay,
+        anneal_trials=search.anneal_trials,
+        warm_restart=search.warm_restart,
+        warm_limit_factor=search.warm_limit_factor,
+    )
+
+
+def first_refining(search: settings.Search) -> int:
+    """The iteration from which a search refines; as many as it has: never."""
+    return round((1 - search.refine_fraction) * search.steps)
+
+
+def rounds_from(refine: int, steps: int, most: int) -> list[int]:
+    """The iterations with which the rounds of a refinement begin: at most so many, as long as each other, not short."""
+    rounds = max(1, min(most, (steps - refine) // SHORTEST_ROUND))
+    return [refine + (steps - refine) * number // rounds for number in range(rounds)]
+
+
+def width_of(search: settings.Search, task: Task) -> float:
+    """The factor of the cost's width with which a search begins: as configured, or what the task's starts ask for."""
+    if search.cost_width_start is not None:
+        return search.cost_width_start
+
+    def first(x: Array, key: Key) -> Array:
+        return costs.of(task.cost, join(x, begin(task.memory, key, x)))
+
+    with jax.ensure_compile_time_eval():
+        x, keys = jnp.asarray(examples(task, STARTS)), jax.random.split(jax.random.key(0), STARTS)
+        return width_for(np.asarray(jax.vmap(first)(x, keys)))
+
+
+def width_for(at_starts: np.ndarray) -> float:
+    """The factor by which a cost is to be `widened` that is `at_starts` [N] in [0, 1] where episodes start.
+
+    With it their mean is at most `SEEN`, so that a search sees a slope towards the goal; 1 where that is so already.
+    """
+    rest = np.clip(1 - np.mean(at_starts, dtype=np.float64), LEAST_REST, 1)
+    return max(1.0, float(np.sqrt(np.log(rest) / np.log(1 - SEEN))))
