@@ -141,3 +141,16 @@ def test_a_hangup_that_is_ignored_stays_ignored() -> None:
     process.send_signal(signal.SIGHUP)
     process.send_signal(signal.SIGTERM)
     assert ended(process) == (143, ["closing", "closed"])
+
+
+def test_a_defect_is_told_whole_and_no_thread_is_torn_down() -> None:
+    """Which would end the compiler's threads at any place, by SIGSEGV or SIGABRT."""
+    code = (
+        "import atexit, sys; from pegasus_jax.cli.main import main; sys.argv = ['x', 'y']\n"
+        "atexit.register(print, 'torn down')\n"
+        "main(lambda words: [][0], '')"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("Traceback")
+    assert done.stderr.endswith("IndexError: list index out of range\n")

@@ -70,10 +70,14 @@ def main(
         code = _code(command, words, text, always)
     except BaseException as error:
         interrupt.clean_up()
-        if not (interrupt.asked() or isinstance(error, KeyboardInterrupt)):
+        if interrupt.asked() or isinstance(error, KeyboardInterrupt):
+            print(_stopped(cli_train.begun[0]) if cli_train.begun else f"stopped; {stopped}", file=sys.stderr)
+            code = interrupt.status()
+        elif isinstance(error, SystemExit):
             raise
-        print(_stopped(cli_train.begun[0]) if cli_train.begun else f"stopped; {stopped}", file=sys.stderr)
-        code = interrupt.status()
+        else:  # a defect: told whole, without the crash of compiling threads that Python's own end brings
+            sys.excepthook(*sys.exc_info())  # type: ignore[arg-type]
+            code = 1
     interrupt.clean_up()
     interrupt.end(code)
 
