@@ -350,10 +350,8 @@ def test_a_folder_that_holds_a_run_is_not_overwritten(whole: Path) -> None:
 def test_help_shows_the_settings_that_the_words_beside_it_leave(tmp_path: Path) -> None:
     shown = {words: call("train", "--help=all", *words.split(), cwd=tmp_path) for words in ("", "task=gym policy=rbf")}
     own, guest = (done.stdout for done in shown.values())
-    assert all(text in own for text in ("search.cost_width_start=2 ", "model.substeps=1 ", "with policy.kind=rbf"))
-    assert all(
-        text in guest for text in ("search.cost_width_start=1 ", "policy.num_centers=30 ", "with policy.kind=mlp")
-    )
+    assert all(text in own for text in ("search.matching=always ", "model.substeps=1 ", "with policy.kind=rbf"))
+    assert all(text in guest for text in ("search.matching=narrow ", "policy.num_centers=30 ", "with policy.kind=mlp"))
     wrong = call("train", "--help", "task=gim", cwd=tmp_path)
     assert (wrong.returncode, wrong.stdout) == (2, "")
     assert "did you mean 'gym'" in wrong.stderr
