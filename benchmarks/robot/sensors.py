@@ -28,7 +28,7 @@ FURUTA = (
     "sensors.velocity=difference",
 )
 CARTPOLE = (
-    *("task=cartpole", "sensors.measured=[0,3]", "sensors.velocity=difference"),
+    *("task=cartpole", "sensors.measured=[0,3]", "sensors.velocity=difference", "explore.kind=walk"),
     "search.observation_noise=plant",  # what the model predicts is twice the sensors' noise
 )
 
