@@ -82,6 +82,8 @@ def test_it_says_what_a_robot_is_like_and_moves_nothing(tmp_path: Path) -> None:
     assert (code, asked) == (0, ["reset", "close"]), said
     for part in ("OrderEnforcing of Arm", "u0 from -2 to 2", "5 periods of 0.05 s", "x0, x1", "more than 1: success"):
         assert part in said
+    assert "begin with a cost 2.6 times as wide" in said
+    assert said.endswith("found  no error; the notes may matter\n")
     assert [path.name for path in tmp_path.iterdir() if path.name not in ("robot.py", "__pycache__")] == ["asked.log"]
 
 

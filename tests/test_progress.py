@@ -171,11 +171,11 @@ def test_a_log_has_a_line_a_phase_and_is_never_silent_for_long(monkeypatch: pyte
         display.phase(1, "fit")
         with display.compiling("fit"):
             time.sleep(0.4)
-        display.phase(1, "search", 0.2, ", step 200 of 1000")
+        display.phase(1, "search", 0.2, ", step 200 of at most 1000")
         time.sleep(1.1)
     lines = text.getvalue().splitlines()
     assert lines[0] == "compiling the fit (once)"
-    assert lines[1] == "trial 1/3  searching a policy, step 200 of 1000"
+    assert lines[1] == "trial 1/3  searching a policy, step 200 of at most 1000"
     assert lines[2] == f"{lines[1]}  1 s so far"
     before = text.getvalue()
     time.sleep(0.8)

@@ -8,7 +8,7 @@ import numpy as np
 
 from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError, shown
-from pegasus_jax.config import Config
+from pegasus_jax.config import Config, Search
 from pegasus_jax.math.circles import entries
 from pegasus_jax.math.units import parted
 from pegasus_jax.policies.rate_limited import largest_change
@@ -189,9 +189,20 @@ def report(config: Config) -> list[str]:
         "time": f"{task.horizon} periods of {task.dt:g} s an episode, {task.horizon * task.dt:g} s"
         + ("" if asked.horizon else "; horizon= changes that"),
         "start": f"{_numbers(task.start_mean)}, give or take {_numbers(task.start_std)}",
-        "cost there": f"{float(task.cost.of_state(start)):.4g}; below {task.success:g} is success",
+        "cost there": f"{float(task.cost.of_state(start)):.4g}; below {task.success:g} is success"
+        + widened(config, task),
     }
-    return [*(f"{name:>12}  {value}" for name, value in facts.items()), *(f"{'note':>12}  {note}" for note in notes)]
+    verdict = "no error" + ("; the notes may matter" if notes else "")
+    lines = [*facts.items(), *(("note", note) for note in notes), ("found", verdict)]
+    return [f"{name:>12}  {value}" for name, value in lines]
+
+
+def widened(config: Config, task: Task) -> str:
+    """How much wider the cost is where a search begins, if it is."""
+    from pegasus_jax.assembly.schedules import width_of
+
+    width = width_of(config.search, task) if isinstance(config.search, Search) else 1.0
+    return f"; searches begin with a cost {width:.2g} times as wide" if width > 1.05 else ""
 
 
 def _numbers(values: Any) -> str:

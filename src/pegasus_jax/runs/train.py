@@ -263,7 +263,7 @@ def improved(
     found = []
     for i in range(program.chunks):
         so_far = f", imagined cost {np.mean(last(found)):.3f}" if found else ""
-        note = f", step {i * program.chunk} of {program.chunks * program.chunk}{so_far}"
+        note = f", step {i * program.chunk} of at most {program.chunks * program.chunk}{so_far}"
         phase(trial, "search", 0.1 + 0.8 * i / program.chunks, note)
         states, searched = program("search", states, np.int32(i * program.chunk))
         found.append(gather(searched))
