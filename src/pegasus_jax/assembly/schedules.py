@@ -20,7 +20,7 @@ ROUNDS, SHORTEST_ROUND = 4, 50  # of a refinement, at most, and its iterations, 
 
 def table_of(search: settings.Search, width: float) -> SearchTable:
     """What the configured search does, visit by visit, where the cost begins `width` times as wide."""
-    first = first_refining(search)
+    first = round((1 - search.refine_fraction) * search.steps)
     most = ROUNDS if search.num_starts == 1 else 1  # of policies side by side none ends before the others
     return search_table(
         search.steps,
@@ -32,11 +32,6 @@ def table_of(search: settings.Search, width: float) -> SearchTable:
         warm_restart=search.warm_restart,
         warm_limit_factor=search.warm_limit_factor,
     )
-
-
-def first_refining(search: settings.Search) -> int:
-    """The iteration from which a search refines; as many as it has: never."""
-    return round((1 - search.refine_fraction) * search.steps)
 
 
 def rounds_from(refine: int, steps: int, most: int) -> list[int]:

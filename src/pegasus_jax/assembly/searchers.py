@@ -9,7 +9,7 @@ import optax
 
 from pegasus_jax import config as settings
 from pegasus_jax import tasks
-from pegasus_jax.assembly.schedules import first_refining, table_of, width_of
+from pegasus_jax.assembly.schedules import table_of, width_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import limits as limited
@@ -109,7 +109,7 @@ def search_of(
         pieces["dynamics"] = limited.held(dynamics, limited.over(constraint, task.stop))
     match = matching_of(search, task).particles(task.angles)
     costs = costs_of(search, task)
-    refines = first_refining(search) < search.steps
+    refines = search.refine_fraction > 0
 
     @cache
     def table() -> SearchTable:
@@ -166,7 +166,7 @@ def tabled(table: Callable[[], SearchTable], searches: Callable[[SearchTable], P
 
 def refines_successes(search: settings.Search | settings.Analytic) -> bool:
     """Whether the search after an episode that succeeded only refines: several policies need all of it."""
-    return isinstance(search, settings.Search) and search.num_starts == 1 and first_refining(search) < search.steps
+    return isinstance(search, settings.Search) and search.num_starts == 1 and search.refine_fraction > 0
 
 
 def analytic_search_of(

@@ -267,7 +267,7 @@ def improved(
         phase(trial, "search", 0.1 + 0.8 * i / program.chunks, note)
         states, searched = program("search", states, np.int32(i * program.chunk))
         found.append(gather(searched))
-        if (iterations(found[-1:]) == 0).all():  # all are done
+        if (iterations(found[-1:]) < program.chunk).all():  # all are done
             break
         program.prepare("succeed", incumbents)  # once; not before the first of the search, for which everybody waits
         if trajectories is not None:
