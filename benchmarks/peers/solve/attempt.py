@@ -35,6 +35,9 @@ class Plant(NamedTuple):
     bar: float  # of the value of a policy
     episodes: int  # from which that value is found
     value: Callable[[list[dict[str, float]]], float]  # of one episode's steps, a mean over episodes
+    angles: tuple[
+        int, ...
+    ] = ()  # entries of the observation that are angles, which some programs take as sine and cosine
 
 
 def success(steps: list[dict[str, float]]) -> float:
@@ -49,7 +52,14 @@ def native(steps: list[dict[str, float]]) -> float:
 
 PLANTS = {
     "cartpole": Plant(
-        "pegasus_envs:pegasus/CartPoleSwingUp-v0", 0.1, 25, ("task=cartpole",), bar=0.9, episodes=20, value=success
+        "pegasus_envs:pegasus/CartPoleSwingUp-v0",
+        0.1,
+        25,
+        ("task=cartpole",),
+        bar=0.9,
+        episodes=20,
+        value=success,
+        angles=(3,),
     ),
     "pendulum": Plant(
         "Pendulum-v1",

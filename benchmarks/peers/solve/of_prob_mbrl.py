@@ -17,7 +17,6 @@ import torch
 from benchmarks.peers.of_prob_mbrl import load
 from benchmarks.peers.solve.attempt import Attempt
 
-ANGLES = {"pegasus_envs:pegasus/CartPoleSwingUp-v0": [3]}
 CART_POLE = 0.6  # length of the pole [m]
 
 
@@ -25,7 +24,7 @@ class Episodes:
     """The plant as an environment of the older gym, which its `apply_controller` drives."""
 
     def __init__(self, attempt: Attempt, to_complex: Any) -> None:
-        self.env, self.dt, self.angles = attempt.env, attempt.plant.dt, ANGLES.get(attempt.plant.env, [])
+        self.env, self.dt, self.angles = attempt.env, attempt.plant.dt, list(attempt.plant.angles)
         self.to_complex = to_complex
 
     def seen(self, x: np.ndarray) -> np.ndarray:

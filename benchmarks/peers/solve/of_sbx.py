@@ -15,7 +15,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from benchmarks.peers.solve.attempt import Attempt
 
 EVERY = 10.0  # [s]
-ANGLES = {"pegasus_envs:pegasus/CartPoleSwingUp-v0": [3]}
 
 
 def seen(x: np.ndarray, angles: list[int]) -> np.ndarray:
@@ -26,7 +25,7 @@ def seen(x: np.ndarray, angles: list[int]) -> np.ndarray:
 def learn(attempt: Attempt, program: str) -> None:
     """Learn until the attempt ends."""
     attempt.begin()
-    angles = ANGLES.get(attempt.plant.env, [])
+    angles = list(attempt.plant.angles)
     size = attempt.env.observation_space.shape[0] + len(angles)  # type: ignore[index]
     space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float32)
     env = gymnasium.wrappers.TransformObservation(attempt.env, lambda x: seen(x, angles), space)
