@@ -203,19 +203,23 @@ def options(defaults: dict[str, Any]) -> dict[str, Any]:
 
 
 def campaign(name: str, run: Callable[..., dict[str, Any]], cases: int, **more: Any) -> None:
-    """A campaign's command: runs it, writes its JSON, prints its figures; status 1 when it found something."""
-    defaults = dict(cases=cases, seed=0, jobs=2, out=str(RESULTS / f"campaign-{name}.json"), folder="") | more
+    """A campaign's command: prints what it found, as JSON to the file `out` too; status 1 when it found something.
+
+    Without `out` nothing is written: a short campaign of an afternoon must not replace the documented figures.
+    """
+    defaults = dict(cases=cases, seed=0, jobs=2, out="", folder="") | more
     chosen = options(defaults)
     given = chosen.pop("folder")
     folder = Path(given or tempfile.mkdtemp(prefix=f"campaign-{name}-")).absolute()
     folder.mkdir(parents=True, exist_ok=True)
-    out, began = Path(chosen.pop("out")), time.monotonic()
+    out, began = chosen.pop("out"), time.monotonic()
     prepare(folder)
     result = run(folder, **chosen)
     asked = shlex.join(["python", "-m", f"tests.campaigns.{name}", *(f"{k}={v}" for k, v in chosen.items())])
     result |= {"command": asked, "minutes": round((time.monotonic() - began) / 60, 1)}
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(json.dumps(result, indent=1) + "\n")
+    if out:
+        Path(out).parent.mkdir(parents=True, exist_ok=True)
+        Path(out).write_text(json.dumps(result, indent=1) + "\n")
     print("\n".join(f"{value!s:>8}  {what}" for what, value in result["figures"].items()))
     for problem in result["problems"][:40]:
         print(f"- {problem}")

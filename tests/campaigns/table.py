@@ -1,4 +1,7 @@
-"""Prints the table of docs/reliability.md from benchmarks/results/campaign-*.json: python -m tests.campaigns.table"""
+"""Prints the table of docs/reliability.md from benchmarks/results/campaign-*.json: python -m tests.campaigns.table
+
+A campaign's words out=benchmarks/results/campaign-NAME.json replace its figures.
+"""
 
 from __future__ import annotations
 

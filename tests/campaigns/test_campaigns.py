@@ -117,6 +117,20 @@ def test_the_documented_table_is_that_of_the_results() -> None:
     assert table.table() in page
 
 
+@pytest.mark.parametrize("words", [[], ["out=figures.json"]])
+def test_figures_are_written_only_where_they_are_asked_for(
+    words: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A short campaign once replaced the documented figures."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["kills", "cases=1", *words])
+    monkeypatch.setattr(common, "prepare", lambda folder: None)
+    monkeypatch.setattr(common, "RESULTS", tmp_path)
+    with pytest.raises(SystemExit):
+        common.campaign("kills", lambda folder, **chosen: {"figures": {}, "problems": []}, 1000)
+    assert [path.name for path in tmp_path.iterdir()] == [word.split("=")[1] for word in words]
+
+
 @pytest.mark.slow
 def test_a_child_ends_as_its_command_does() -> None:
     assert common.forked(lambda: sys.exit(3), 10).status == 3
