@@ -18,8 +18,9 @@ from pegasus_jax.imagine.rollout import NoiseUse
 from pegasus_jax.imagine.scenarios import Sampler, sampler
 from pegasus_jax.learn.gradient import gradient_search
 from pegasus_jax.learn.rounds import after_row, unrefined
-from pegasus_jax.learn.schedule import SearchTable, search_table
+from pegasus_jax.learn.schedule import STEP, SearchTable, search_table
 from pegasus_jax.learn.search import Problem, searcher
+from pegasus_jax.learn.widening import holding
 from pegasus_jax.types import Cost, Period, Scenarios, TrainState
 from probes import (
     EMITTERS,
@@ -328,15 +329,62 @@ def test_a_search_that_only_refines_is_the_last_part_of_a_whole_one(calls):
     found, learner = on_table(table, optimizer, follow, rowless)
     run, infos = jax.jit(partial(found.run, steps=6 // calls)), []
     for call in range(calls):
-        learner, info = run(jax.random.key(7), learner, 1.0, first=call * (6 // calls), only_refines=True)
+        learner, info = run(jax.random.key(7), learner, 1.0, first=call * (6 // calls), works=True)
         infos.append(info)
     np.testing.assert_allclose(learner.params, expected.params, rtol=1e-6)
     objective, done = np.concatenate([i.objective for i in infos]), sum(int(i.iterations) for i in infos)
     np.testing.assert_allclose(objective, [*wanted.objective, *[np.nan] * 4], rtol=1e-6)
     assert done == wanted.iterations == 2
-    _, info = run(jax.random.key(7), on_table(table, optimizer)[1], 1.0, first=0, only_refines=False)
+    _, info = run(jax.random.key(7), on_table(table, optimizer)[1], 1.0, first=0, works=False)
     assert info.iterations == 6 // calls
     assert run._cache_size() == 1
+
+
+def test_what_works_is_refined_but_in_the_first_second_fourth_eighth_search():
+    """One that does not work, as with `False`, begins the count again."""
+    found, learner = on_table(search_table(6, init="better", refine=4), optax.adam(0.1), value=rowless)
+    run, done = jax.jit(partial(found.run, steps=6, fresh=jnp.zeros(3))), []
+    for works in [True] * 9 + [False] + [True] * 3:
+        learner, info = run(jax.random.key(7), learner, 1.0, first=0, works=works)
+        done.append(int(info.iterations))
+    assert done == [6, 6, 2, 6, 2, 2, 2, 6, 2, 6, 6, 6, 2]
+    assert run._cache_size() == 1
+
+
+@pytest.mark.parametrize(("works", "starts"), [(False, 1.0), (True, 9.0)])
+def test_a_whole_search_that_is_given_what_works_begins_with_a_fresh_policy_and_ends_with_the_better(works, starts):
+    """Here the fresh one costs more, and steps do not move it."""
+    found, learner = on_table(search_table(2, init="better", refine=1), optax.sgd(0.0), STILL, rowless)
+    fresh = jnp.full(3, 3.0)
+    after, info = found.run(jax.random.key(0), learner, 1.0, steps=2, fresh=fresh, works=works)
+    np.testing.assert_allclose(info.objective, [3.0, 3.0])  # of the policy at the end of each iteration
+    assert np.array_equal(after.params, np.ones(3))
+    moving, learner = on_table(search_table(3, init="better", refine=2), optax.sgd(0.0), STILL, rowless)
+    _, info = moving.run(jax.random.key(0), learner, 1.0, steps=1, fresh=fresh, works=works)
+    np.testing.assert_allclose(info.objective, [3 * starts])
+
+
+@pytest.mark.parametrize("calls", [1, 4])
+@pytest.mark.parametrize(("holds", "found_it"), [(False, False), (True, True)])
+def test_a_cost_that_is_too_flat_is_held_wider_until_a_search_can_follow_it(holds, found_it, calls):
+    """A narrow well fourteen widths away: single precision's 1 has no slope, that of a wider well has one."""
+
+    def well(params, posterior, scenarios, row):
+        return 1 - jnp.exp(-0.5 * ((params[0] - 15) / row.cost_width) ** 2)
+
+    table = holding(search_table(400)) if holds else search_table(400)
+    found, learner = on_table(table, optax.adam(0.1), STILL, well)
+    run = jax.jit(partial(found.run, steps=400 // calls))
+    for call in range(calls):
+        learner, _ = run(jax.random.key(0), learner, 1.0, first=call * (400 // calls))
+    np.testing.assert_allclose(learner.params[0], 15 if found_it else 1, atol=0.1)
+    assert learner.optimizer.widening == 1  # it falls back
+
+
+def test_only_steps_before_a_refinement_hold_a_cost():
+    table = holding(search_table(4, init="better", refine=2))
+    assert np.array_equal(table.holds, (table.action == STEP) & (table.iteration < 2))
+    assert not search_table(4, refine=2).holds.any()
 
 
 @pytest.mark.parametrize("calls", [1, 5])

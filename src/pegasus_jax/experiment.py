@@ -114,7 +114,7 @@ def experiment(
     policy whose newest episode succeeded is followed only by one that is expected to cost less.
     `remember(posterior, state)` is what all of them are given in a posterior's place. With an environment instead of a
     plant in JAX, `episode` and `collect` are not pure, and `drive` is there. With `refine_successes` the search
-    after an episode that succeeded is called with only_refines=True.
+    after an episode that succeeded is called with works=True.
     """
     states, controls, memory = len(task.state_names), len(task.control_names), task.memory
     see, given, _ = recall.steps(memory)
@@ -221,7 +221,7 @@ def experiment(
             earlier=jnp.maximum(state.trial - first_search, 0),
             steps=steps,
             fresh=fresh,
-            **({"only_refines": worked} if refine_successes else {}),
+            **({"works": worked} if refine_successes else {}),
         )
         return state._replace(policy=learner), info
 

@@ -7,13 +7,13 @@ import numpy as np
 from pegasus_jax import config as settings
 from pegasus_jax.imagine import costs
 from pegasus_jax.learn.schedule import SearchTable, search_table
+from pegasus_jax.learn.widening import SEEN, holding
 from pegasus_jax.memory import begin, join
 from pegasus_jax.task import Task
 from pegasus_jax.tasks.starts import examples
 from pegasus_jax.types import Array, Key
 
 STARTS = 256  # at which the cost is looked at
-SEEN = 0.9  # a greater cost is too flat to be followed: docs/decisions.md 0033
 LEAST_REST = 1e-7  # of 1 - cost: less is rounding in single precision
 ROUNDS, SHORTEST_ROUND = 4, 50  # of a refinement, at most, and its iterations, at least: docs/decisions.md 0032
 
@@ -22,7 +22,7 @@ def table_of(search: settings.Search, width: float) -> SearchTable:
     """What the configured search does, visit by visit, where the cost begins `width` times as wide."""
     first = round((1 - search.refine_fraction) * search.steps)
     most = ROUNDS if search.num_starts == 1 else 1  # of policies side by side none ends before the others
-    return search_table(
+    table = search_table(
         search.steps,
         init="previous" if search.num_starts > 1 else search.init,  # of several, others are fresh
         refine=rounds_from(first, search.steps, most) if search.refine_fraction else None,
@@ -32,6 +32,7 @@ def table_of(search: settings.Search, width: float) -> SearchTable:
         warm_restart=search.warm_restart,
         warm_limit_factor=search.warm_limit_factor,
     )
+    return holding(table) if search.cost_width_start is None else table
 
 
 def rounds_from(refine: int, steps: int, most: int) -> list[int]:

@@ -117,7 +117,7 @@ def search_of(
 
     def value(params: Params, posterior: Params, given: Scenarios, row: SearchTable, *weight: Array) -> Any:
         # What no row asks for is not compiled.
-        refining, widens = row.refine if refines else None, (table().cost_width != 1).any()
+        refining, widens = row.refine if refines else None, (table().cost_width != 1).any() or table().holds.any()
         given = started(given, row.refine) if search.visited_starts else given
         return objective_of(
             params,
@@ -165,7 +165,7 @@ def tabled(table: Callable[[], SearchTable], searches: Callable[[SearchTable], P
 
 
 def refines_successes(search: settings.Search | settings.Analytic) -> bool:
-    """Whether the search after an episode that succeeded only refines: several policies need all of it."""
+    """Whether a search after an episode that succeeded may only refine: several policies need all of it."""
     return isinstance(search, settings.Search) and search.num_starts == 1 and search.refine_fraction > 0
 
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from pegasus_jax.checks import choice
 from pegasus_jax.config import INITS
+from pegasus_jax.math.decay import half_cosine
 
 EVALUATE, STEP = range(2)  # what a row does with the candidate whose cost and gradient it computes
 CURRENT, FRESH, START, COARSE = range(4)  # which parameters it visits: see `SearchTable.candidate`
@@ -30,6 +31,7 @@ class SearchTable(NamedTuple):
     refine: Any  # [R] whether the objective is the refining one
     counts: Any  # [R] whether a step's objective counts in the mean of its round of refinement
     ends: Any  # [R] whether a round of refinement ends with the row: the search is over if it has gained nothing
+    holds: Any  # [R] whether a step's cost is held wider where it is too flat: learn/widening.py
     cost_width: Any  # [T, R] factor of the cost's width
     step_size: Any  # [T, R] factor of the optimizer's update
     limit: Any  # [T, R] factor of the limit on a particle's gradient
@@ -77,12 +79,8 @@ def search_table(
     step_size = np.where(annealed, step_size, warm_restart * half_cosine(scenarios / max(steps, 1), decay))
     limit = np.where(annealed, np.ones(i.shape), warm_limit_factor)
     counts, ends = refines & (action == STEP) & (passed >= 1 - JUDGED), (candidate == COARSE) & (action == EVALUATE)
-    return SearchTable(iteration, scenarios, action, candidate, refines, counts, ends, width, step_size, limit)
-
-
-def half_cosine(fraction: Any, decay: float) -> np.ndarray:
-    """A factor that falls from 1 to `decay` as the fraction goes from 0 to 1, and stays there."""
-    return (1 - decay) * (1 + np.cos(np.pi * np.minimum(fraction, 1))) / 2 + decay
+    flags = refines, counts, ends, np.zeros(len(rows), bool)
+    return SearchTable(iteration, scenarios, action, candidate, *flags, width, step_size, limit)
 
 
 def first_rows(table: SearchTable) -> np.ndarray:

@@ -13,7 +13,7 @@ from pegasus_jax.imagine.scenarios import Sampler
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.learn.rounds import Progress, unrefined
 from pegasus_jax.learn.schedule import FRESH, STEP, SearchTable, first_rows
-from pegasus_jax.learn.visits import Ascend, after, begun, of_search, valued
+from pegasus_jax.learn.visits import Ascend, after, begun, of_search, only_refines, renewed, valued
 from pegasus_jax.types import Array, Key, Params, PolicyOptimizer, TrainState
 
 
@@ -24,7 +24,9 @@ class SearchState(NamedTuple):
     start: Params  # what the search, or its refinement, started from
     last: Array  # [] the objective at the row before
     no_improvement: Array  # [] whether the last search found nothing better than what it was given, before it refined
+    worked: Array  # [] how many searches in a row, this one included, were given a policy that works
     progress: Progress  # of the rounds of its refinement
+    widening: Array  # [] how much wider than the table says the cost is: learn/widening.py
     multiplier: Any = None  # [] of a constraint's penalty, kept from search to search; None: there is no constraint
 
 
@@ -35,7 +37,7 @@ class Problem(NamedTuple):
     sampler: Sampler
     optimizer: optax.GradientTransformation  # any of optax
     table: SearchTable
-    only_refines: Array | bool = False  # [] whether a search skips all iterations before those that refine
+    works: Array | bool = False  # [] whether the policy that a search is given works
     reset_optimizer: bool = True  # whether each search starts with a new optimizer state
     # What a constraint makes of its multiplier; None: there is none. With it the objective's last argument is the
     # multiplier, and it returns (value, probability).
@@ -46,11 +48,11 @@ def searcher(problem: Problem) -> PolicyOptimizer:
     """The searcher of a problem: its `run` is `search`, its learner's optimizer a `SearchState`."""
 
     def init(params: Params) -> SearchState:
-        none = jnp.asarray(jnp.inf, float), jnp.zeros((), bool), unrefined(), begun(problem.ascend)
-        return SearchState(problem.optimizer.init(params), params, *none)
+        none = jnp.asarray(jnp.inf, float), jnp.zeros((), bool), jnp.int32(0), unrefined(), jnp.ones((), float)
+        return SearchState(problem.optimizer.init(params), params, *none, begun(problem.ascend))
 
-    def run(*given: Any, only_refines: Array | bool = False, **where: Any) -> tuple[TrainState, SearchInfo]:
-        return search(*given, problem=problem._replace(only_refines=only_refines), **where)
+    def run(*given: Any, works: Array | bool = False, **where: Any) -> tuple[TrainState, SearchInfo]:
+        return search(*given, problem=problem._replace(works=works), **where)
 
     return PolicyOptimizer(init, run)
 
@@ -68,10 +70,10 @@ def search(
 ) -> tuple[TrainState, SearchInfo]:
     """The rows of iterations first .. first + steps - 1 of the problem's table, in the search after `earlier` others.
 
-    A search that only refines begins at the first that does, as 0, and one ends with a round of refinement that has
-    gained nothing (learn/rounds.py); what it lacks is NaN in the info [n]. One call of n steps and two of n/2, the
-    second with first=n/2, do the same. `fresh` is a policy that the table may ask for. All rows visit one objective:
-    two take twice as long to compile. Raises ValueError for more iterations than the table has, or no fresh policy.
+    A search that only refines (`only_refines`) begins at the first that does, as 0, and one ends with a round of
+    refinement that has gained nothing (learn/rounds.py); what it lacks is NaN in the info [n]. One call of n steps and
+    two of n/2, the second with first=n/2, do the same. `fresh` is a policy that the table may ask for. Raises
+    ValueError for more iterations than the table has, or no fresh policy.
     """
     table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)
     if steps > (most := len(begin) - 1):
@@ -80,19 +82,19 @@ def search(
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
     rows = of_search(table, earlier)
     following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
-    offset = first + jnp.where(problem.only_refines, np.sum(~table.refine[begin[:-1]]), 0)
+    learner = optax.tree.where(jnp.asarray(first) == 0, renewed(problem, learner), learner)
+    offset = first + jnp.where(only_refines(table, learner.optimizer.worked), np.sum(~table.refine[begin[:-1]]), 0)
     row, end = (jnp.asarray(begin)[jnp.minimum(i, most)] for i in (offset, offset + steps))
     count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
 
-    def going(loop: tuple) -> Array:
-        return (loop[0] < count) & ~loop[1].optimizer.progress.over if table.ends.any() else loop[0] < count
+    over = lambda learner: table.ends.any() & learner.optimizer.progress.over  # noqa: E731
 
     def visit(loop: tuple) -> tuple:
         k, learner, scenarios, info = loop
         now: SearchTable = jax.tree.map(lambda column: column[row + k], rows)
         (own, state), choose, i = learner, partial(jax.lax.select_n, now.candidate), now.iteration - offset
         visited = jax.tree.map(choose, own, fresh if asks else own, state.start, state.start)
-        value, gradient, weight = valued(problem, state.multiplier, visited, posterior, scenarios, now)
+        value, gradient, weight = valued(problem, state, visited, posterior, scenarios, now)
         learner, cost, skipped = after(now, learner, visited, value, gradient, weight, problem)
         norm, stepped = optax.tree.norm(gradient), jnp.where(now.action == STEP, i, steps)
         scenarios = sampler.redraw(key, following[row + k], scenarios, posterior)
@@ -100,11 +102,7 @@ def search(
         found = SearchInfo(info.objective.at[i].set(cost), norms, info.skipped + skipped, i + 1)
         return k + 1, learner, scenarios, found
 
-    params, state = learner
-    optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
-    new = state._replace(optimizer=optimizer, start=params, progress=unrefined())
-    learner = TrainState(params, optax.tree.where(jnp.asarray(first) == 0, new, state))
     scenarios, none = sampler.draw(key, jnp.asarray(offset, jnp.int32), posterior), jnp.full(steps, jnp.nan)
     begun = jnp.int32(0), learner, scenarios, SearchInfo(none, none, jnp.int32(0), jnp.int32(0))
-    _, learner, _, info = jax.lax.while_loop(going, visit, begun)
+    _, learner, _, info = jax.lax.while_loop(lambda loop: (loop[0] < count) & ~over(loop[1]), visit, begun)
     return learner, info

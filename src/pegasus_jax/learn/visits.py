@@ -11,9 +11,10 @@ import jax.numpy as jnp
 import optax
 
 from pegasus_jax.imagine.limits import FIRST
-from pegasus_jax.learn.rounds import after_row
-from pegasus_jax.learn.schedule import START, STEP, SearchTable
+from pegasus_jax.learn.rounds import after_row, unrefined
+from pegasus_jax.learn.schedule import FRESH, START, STEP, SearchTable
 from pegasus_jax.learn.updates import is_finite, update_if
+from pegasus_jax.learn.widening import after_step, widened
 from pegasus_jax.types import Array, Params, TrainState
 
 # (multiplier, probability that an episode breaks the constraint) -> multiplier after a step; None: no constraint
@@ -25,8 +26,31 @@ def begun(ascend: Ascend) -> Array | None:
     return None if ascend is None else jnp.asarray(FIRST, float)
 
 
-def valued(problem: Any, multiplier: Any, *given: Any) -> tuple[Array, Params, Array | None]:
-    """A problem's objective, its gradient with respect to the first of `given`, and the multiplier after a step."""
+def renewed(problem: Any, learner: TrainState) -> TrainState:
+    """The learner of a search that begins: it forgets what belonged to the one before."""
+    params, state = learner
+    optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
+    worked, widening = jnp.where(problem.works, state.worked + 1, 0), jnp.ones((), float)
+    forgotten = dict(optimizer=optimizer, start=params, progress=unrefined(), widening=widening)
+    return TrainState(params, state._replace(**forgotten, worked=worked))
+
+
+def only_refines(table: SearchTable, worked: Array) -> Array:
+    """Whether a search skips what comes before its refinement, where `worked` [] in a row were given what works.
+
+    Of a table that compares with a fresh policy the 1st, 2nd, 4th, 8th, ... of them do all of it, from that: one that
+    works may be far from the best, and then a refinement does not find that (docs/decisions.md 0035).
+    """
+    compares = ((table.candidate == FRESH) & (table.action != STEP)).any()
+    return worked & (worked - 1) != 0 if compares else worked > 0
+
+
+def valued(problem: Any, state: Any, *given: Any) -> tuple[Array, Params, Array | None]:
+    """A problem's objective, its gradient with respect to the first of `given`, and the multiplier after a step.
+
+    The last of `given` is the row.
+    """
+    given, multiplier = (*given[:-1], widened(given[-1], state.widening)), state.multiplier
     if problem.ascend is None:
         return *jax.value_and_grad(problem.objective)(*given), None
     (value, chance), gradient = jax.value_and_grad(problem.objective, has_aux=True)(*given, multiplier)
@@ -46,7 +70,9 @@ def after(
     (params, state), finite, steps_now = learner, is_finite(gradient), row.action == STEP
     # NaN decides for the older policy, a tie for the other one: where the cost is flat, nothing else leads away.
     older = ~(state.last < value)
-    taken = jnp.stack([True, (value <= state.last) | state.no_improvement, older, older])[row.candidate] | steps_now
+    # A fresh policy is also where a search begins that is to find another than the given one.
+    fresh = (value <= state.last) | state.no_improvement | (state.worked > 0)
+    taken = jnp.stack([True, fresh, older, older])[row.candidate] | steps_now
     params = optax.tree.where(taken, visited, params)
     now = TrainState(params, state.optimizer)
     updates, moved = update_if(steps_now & finite, problem.optimizer, gradient, now, value=value)
@@ -55,6 +81,7 @@ def after(
         start=optax.tree.where(row.candidate >= START, params, state.start),
         last=value,
         progress=after_row(state.progress, row, value),
+        widening=after_step(state.widening, row, value),
         no_improvement=jnp.where(row.candidate == START, taken, state.no_improvement),
         # After a step only: what rows compare is weighed alike.
         multiplier=None if multiplier is None else jnp.where(steps_now, multiplier, state.multiplier),
