@@ -83,11 +83,14 @@ def search(
     rows = of_search(table, earlier)
     following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
     learner = optax.tree.where(jnp.asarray(first) == 0, renewed(problem, learner), learner)
-    offset = first + jnp.where(only_refines(table, learner.optimizer.worked), np.sum(~table.refine[begin[:-1]]), 0)
+    # Without a word of what works all begin at 0: seeds side by side then have one number, and one loop.
+    skips = problem.works is not False and only_refines(table, learner.optimizer.worked)
+    offset = first + jnp.where(skips, np.sum(~table.refine[begin[:-1]]), 0)
     row, end = (jnp.asarray(begin)[jnp.minimum(i, most)] for i in (offset, offset + steps))
     count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
 
-    over = lambda learner: table.ends.any() & learner.optimizer.progress.over  # noqa: E731
+    def going(loop: tuple) -> Array:  # seeds side by side have one condition where no round ends a search
+        return (loop[0] < count) & ~loop[1].optimizer.progress.over if table.ends.any() else loop[0] < count
 
     def visit(loop: tuple) -> tuple:
         k, learner, scenarios, info = loop
@@ -104,5 +107,5 @@ def search(
 
     scenarios, none = sampler.draw(key, jnp.asarray(offset, jnp.int32), posterior), jnp.full(steps, jnp.nan)
     begun = jnp.int32(0), learner, scenarios, SearchInfo(none, none, jnp.int32(0), jnp.int32(0))
-    _, learner, _, info = jax.lax.while_loop(lambda loop: (loop[0] < count) & ~over(loop[1]), visit, begun)
+    _, learner, _, info = jax.lax.while_loop(going, visit, begun)
     return learner, info
