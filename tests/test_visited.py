@@ -99,7 +99,7 @@ def test_only_a_search_that_refines_starts_there(refining):
 def test_a_refinement_starts_there_and_what_is_imagined_afterwards_does_not():
     task, found = cart(), []
     for share in (0.0, 1.0):
-        config = tiny(search__visited_starts=share, search__refine_fraction=0.5, search__steps=4, fit__steps=2)
+        config = tiny(search__visited_starts=share, search__refine_fraction=0.5, search__steps=20, fit__steps=2)
         exp = compose(config, task, dynamics=regression(len(task.state_names), len(task.control_names)))
         state = exp.init(jax.random.key(0))
         state = exp.add_episode(state, jax.jit(exp.collect)(state))
