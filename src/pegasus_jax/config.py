@@ -108,7 +108,7 @@ class Search:
     cost_width_start: float | None = setting(
         None,
         "the cost's width at the start of a search, as a factor; back to 1 by half of it. null: what lets it fall"
-        " where episodes start, 1 where it does so already",
+        " where episodes start, 1 where it does so already; and it waits while all that is imagined costs nearly 1",
     )
     anneal_trials: int = setting(1, "trials over which cost_width_start= and decay= run down once; 1: in every search")
     particle_grad_limit: float | None = setting(

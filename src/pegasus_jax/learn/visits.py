@@ -30,9 +30,9 @@ def renewed(problem: Any, learner: TrainState) -> TrainState:
     """The learner of a search that begins: it forgets what belonged to the one before."""
     params, state = learner
     optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
-    worked, widening = jnp.where(problem.works, state.worked + 1, 0), jnp.ones((), float)
-    forgotten = dict(optimizer=optimizer, start=params, progress=unrefined(), widening=widening)
-    return TrainState(params, state._replace(**forgotten, worked=worked))
+    worked = jnp.where(problem.works, state.worked + 1, 0)
+    new = dict(optimizer=optimizer, start=params, worked=worked, progress=unrefined(), widening=jnp.ones((), float))
+    return TrainState(params, state._replace(**new))
 
 
 def only_refines(table: SearchTable, worked: Array) -> Array:
