@@ -39,6 +39,7 @@ ONE_CORE = {
         [*(str(ROOT / name) for name in ("src", "envs", "")), os.environ.get("PYTHONPATH", "")]
     ),
 }
+JAX_NOTE = "For simplicity, JAX has removed"  # below the line that says what happened
 SHARES = (0.25, 0.5, 0.75, 1.0)  # of the time by which a plant is to be learned, at which the table looks
 
 
@@ -75,7 +76,8 @@ def on_core(command: list[str], core: int | None, limit: float | None) -> tuple[
         except subprocess.TimeoutExpired:
             process.terminate()
             said, failed = process.communicate()
-    return said, None if process.returncode == 0 else (failed.strip().splitlines() or ["no message"])[-1]
+    lines = [line for line in failed.splitlines() if line.strip("- ") and not line.startswith(JAX_NOTE)]
+    return said, None if process.returncode == 0 else (lines or ["no message"])[-1]
 
 
 def share(runs: Sequence[dict[str, Any]], bar: float, until: float) -> float:

@@ -14,7 +14,7 @@ import gymnasium
 import numpy as np
 
 from pegasus_jax import controller
-from pegasus_jax.runs import checkpoint, store
+from pegasus_jax.runs import checkpoint, config_io, store
 
 EPISODES, FIRST_RESET = 10, 10_000
 
@@ -36,10 +36,12 @@ def returns(control: Any, env: Any, episodes: int = EPISODES) -> tuple[list[floa
 def scores(run: Path, name: str) -> list[dict[str, Any]]:
     """One row for each trial that has a policy and a row of its own."""
     env, rows = gymnasium.make(name), []
+    seen = list(config_io.load(run / "config.yaml").sensors.measured) or slice(None)
     for row in store.trials(run):
         if row["trial"] not in checkpoint.available(run):
             continue
-        totals, lengths = returns(controller(run, trial=row["trial"]), env)
+        control = controller(run, trial=row["trial"])
+        totals, lengths = returns(lambda x, control=control: control(x[seen]), env)
         told = {key: row[key] for key in ("trial", "plant_seconds", "policy", "episode_cost", "objective_fresh")}
         rows.append(told | {"native": round(float(np.mean(totals)), 3), "returns": totals, "lengths": lengths})
     return rows

@@ -3,11 +3,14 @@
 from typing import NamedTuple
 
 
-def task(horizon: int, cost: str, stop: str = "", angles: str = "[]", module: str = "costs") -> tuple[str, ...]:
+def task(
+    horizon: int, cost: str, stop: str = "", angles: str = "[]", module: str = "costs", rates: str = ""
+) -> tuple[str, ...]:
     """The words of pegasus-train that describe a task, with functions of costs.py or another module here."""
     named = {"cost": cost, "stop": stop}
     functions = (f"{setting}=benchmarks.plants_suite.{module}:{name}" for setting, name in named.items() if name)
-    return (f"horizon={horizon}", f"angles={angles}", *functions)
+    known = [f"rates={rates}"] if rates else []  # for model=lagrangian
+    return (f"horizon={horizon}", f"angles={angles}", *known, *functions)
 
 
 class Plant(NamedTuple):
@@ -23,14 +26,25 @@ class Plant(NamedTuple):
 DM = "benchmarks.plants_suite.of_dm_control:dm_control/"
 IP, IDP = "InvertedPendulum-v5", "InvertedDoublePendulum-v5"
 PLANTS: dict[str, Plant] = {
-    "Pendulum-v1": Plant("Pendulum-v1", task(40, "pendulum"), 12, -200.0, 16.0),
-    IP: Plant(IP, task(50, "inverted_pendulum", "inverted_pendulum_falls", angles="[1]"), 20, 950.0, 30.0),
-    IDP: Plant(IDP, task(40, "double_pendulum", "double_pendulum_falls"), 30, 8500.0, 60.0),
+    "Pendulum-v1": Plant("Pendulum-v1", task(40, "pendulum", rates="[2]"), 12, -200.0, 16.0),
+    IP: Plant(
+        IP, task(50, "inverted_pendulum", "inverted_pendulum_falls", angles="[1]", rates="[2,3]"), 20, 950.0, 30.0
+    ),
+    # The last entry is a force, and no part of the state.
+    IDP: Plant(
+        IDP,
+        (*task(40, "double_pendulum", "double_pendulum_falls", rates="[5,6,7]"), "sensors.measured=[0,1,2,3,4,5,6,7]"),
+        30,
+        8500.0,
+        60.0,
+    ),
     "Reacher-v5": Plant("Reacher-v5", task(50, "reacher"), 60, -6.0, 60.0),
-    "dm_cartpole": Plant(f"{DM}CartPole-v0", task(25, "dm_cartpole", angles="[1]"), 12, 850.0, 25.0),
+    "dm_cartpole": Plant(f"{DM}CartPole-v0", task(25, "dm_cartpole", angles="[1]", rates="[2,3]"), 12, 850.0, 25.0),
     "dm_pendulum": Plant(
-        f"{DM}Pendulum-v0", task(80, "pendulum", angles="[0]", module="costs_of_joints"), 8, 800.0, 40.0
+        f"{DM}Pendulum-v0", task(80, "pendulum", angles="[0]", module="costs_of_joints", rates="[1]"), 8, 800.0, 40.0
     ),
     # Its return is minus the sum of the cost: a swing-up that holds has some -11, a slow one that never holds -16.
-    "CartPole": Plant("pegasus_envs:pegasus/CartPoleSwingUp-v0", task(25, "cartpole", angles="[3]"), 15, -12.5, 20.0),
+    "CartPole": Plant(
+        "pegasus_envs:pegasus/CartPoleSwingUp-v0", task(25, "cartpole", angles="[3]", rates="[1,2]"), 15, -12.5, 20.0
+    ),
 }
