@@ -94,7 +94,7 @@ def test_no_word_gives_the_defaults():
 
 def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorithms():
     own = config_io.parse({})
-    assert own.model == Lagrangian(substeps=1)
+    assert own.model == Lagrangian(ensemble_size=1, substeps=1)
     named = config_io.parse({"task": "cartpole", "model": "lagrangian", "algorithm": "pegasus"})
     assert own == named
     network = config_io.parse({"task": "cartpole", "model": "log_normal"})

@@ -14,9 +14,11 @@ import pytest
 
 from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import build
+from pegasus_jax.assembly.pieces import dynamics_of
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.config import Config
+from pegasus_jax.config import Config, Lagrangian
 from pegasus_jax.runs import config_io, store
+from pegasus_jax.types import Dataset
 
 # (task, legs, states, controls, horizon, control period [s])
 SHAPES = [
@@ -107,3 +109,18 @@ def test_a_tiny_trial_through_the_command_line(words: list[str], tmp_path: Path)
     assert np.all((u >= task.control_low - 1e-5) & (u <= task.control_high + 1e-5))
     assert np.ptp(u, axis=0).min() > 0
     assert words[0] in json.loads((run / "run.json").read_text())["command"]
+
+
+def test_a_mechanism_of_ones_own_is_five_and_takes_the_steps_that_its_coordinates_need() -> None:
+    """`model=lagrangian` on a user's plant; three coordinates are integrated as with substeps=4, and not with 1."""
+    own = config_io.parse({"task": "gym", "model": "lagrangian", "rates": "[2,3]"})
+    assert (own.model.ensemble_size, own.model.substeps, own.fit.steps, own.search.particles) == (5, None, 1000, 50)
+    task, x, u = tasks.make("double_cartpole"), jnp.array([0.1, 0.2, 3.0, -4.0, 2.0, 1.0]), jnp.array([5.0])
+    data = Dataset(jnp.ones((4, 6)), jnp.ones((4, 1)), jnp.arange(24.0).reshape(4, 6), jnp.int32(4))
+    changes = {}
+    for substeps in (None, 1, 4):
+        dynamics = dynamics_of(Lagrangian(ensemble_size=1, dropout="none", substeps=substeps), task)
+        posterior = dynamics.posterior(dynamics.init(jax.random.key(0)), data)
+        changes[substeps] = dynamics.apply(posterior, dynamics.sample(jax.random.key(1), posterior), x, u).mean
+    assert (changes[None] == changes[4]).all()
+    assert not jnp.allclose(changes[None], changes[1])

@@ -30,6 +30,7 @@ FURUTA = (
 CARTPOLE = (
     *("task=cartpole", "sensors.measured=[0,3]", "sensors.velocity=difference", "explore.kind=walk"),
     "search.observation_noise=plant",  # what the model predicts is twice the sensors' noise
+    *("model.ensemble_size=5", "fit.steps=1000"),  # what model=lagrangian is on any other plant
 )
 
 

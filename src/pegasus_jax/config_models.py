@@ -57,12 +57,16 @@ class Lagrangian(_Network):
     """Dynamics of a mechanism whose energies are a Bayesian neural network, or an ensemble of them."""
 
     kind: str = setting("lagrangian", "")
+    ensemble_size: int = setting(5, "mechanisms fitted side by side; each particle follows one of them")
     hidden: tuple[int, ...] = setting((32, 32), "widths of the hidden layers")
-    substeps: int = setting(2, "Runge-Kutta steps a control period")
+    substeps: int | None = setting(
+        None, "Runge-Kutta steps a control period; null: 1 for up to two coordinates, 4 for more, which may be chaotic"
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        checks.size("model.substeps", self.substeps)
+        if self.substeps is not None:
+            checks.size("model.substeps", self.substeps)
 
 
 @dataclass(frozen=True)

@@ -30,12 +30,9 @@ from pegasus_jax.config import (
     Search,
 )
 
-# Of a mechanism's integration, where a task needs others than most: docs/decisions.md 0009.
-_SUBSTEPS = {"cartpole": 1}  # its pole never turns fast enough for two to matter
-
 CARTPOLE = Config(
     task="cartpole",
-    model=Lagrangian(substeps=_SUBSTEPS["cartpole"]),
+    model=Lagrangian(ensemble_size=1, substeps=1),  # docs/decisions.md 0036
     fit=Fit(steps=3000, learning_rate=3e-3),
     # docs/decisions.md 0014, 0015 and 0029.
     search=Search(particles=50, standardized_noise=True, refine_fraction=0.5),
@@ -45,7 +42,7 @@ CARTPOLE = Config(
 DOUBLE_CARTPOLE = Config(
     task="double_cartpole",
     trials=40,
-    model=Lagrangian(substeps=4),
+    model=Lagrangian(ensemble_size=1, substeps=4),
     policy=MLP(hidden=(50,) * 4, input_units=(1.0, 3.0, 6.0, 8.0)),
     fit=Fit(steps=5000, learning_rate=3e-3, decay=0.03),
     search=Search(
@@ -142,8 +139,9 @@ def _network(**changes: Any) -> Change:
 
 def _lagrangian(config: Config) -> Config:
     assert isinstance(config.model, BNN)
-    model = Lagrangian(initializer=config.model.initializer, substeps=_SUBSTEPS.get(config.task, Lagrangian.substeps))
-    return replace(config, model=model, fit=Fit(steps=3000, learning_rate=3e-3))
+    # Five mechanisms know what they do not know: docs/decisions.md 0036.
+    model, search = Lagrangian(initializer=config.model.initializer), replace(config.search, particles=50)
+    return replace(config, model=model, fit=Fit(steps=1000, learning_rate=3e-3), search=search)
 
 
 def _dropout(rate: float) -> Change:

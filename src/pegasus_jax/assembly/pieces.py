@@ -81,7 +81,8 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
             )
         case settings.Lagrangian():
             rates = tasks.rates_of(task)
-            member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=config.substeps)
+            substeps = config.substeps or (1 if len(rates) <= 2 else 4)  # docs/decisions.md 0009
+            member = lagrangian(**shape, **network_of(config), rates=rates, dt=task.dt, substeps=substeps)
         case settings.BNN():
             # What a good simulator gets wrong may be all noise.
             head = HEADS["sigmoid" if task.prior is None else "softplus"]
