@@ -35,14 +35,15 @@ class Row(NamedTuple):
 
 
 ROWS = (
-    Row("cart-pole", "cartpole", ("cartpole-rounds",)),
-    Row("cart-pole, the paper's network", "cartpole_network", ("cartpole_network-rounds",)),
+    Row("cart-pole", "cartpole", ("cartpole-50",)),
+    Row("cart-pole, the paper's network", "cartpole_network", ("cartpole_network-50",)),
     Row(
         "cart-pole as your own plant: any cost, network",
         "cartpole_network",
-        ("cartpole-own_cost-rounds",),
+        ("cartpole-own_cost-50",),
         own_cost,
     ),
+    Row("the same with a mechanism", "cartpole", ("cartpole-own_cost-mechanism",), own_cost),
     Row("double cart-pole, on a GPU", "double_cartpole_gpu", ("double_cartpole-reheated",)),
     Row("double cart-pole, on a CPU", "double_cartpole", ("double_cartpole-integrated",)),
     Row(

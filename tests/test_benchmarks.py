@@ -224,7 +224,7 @@ def test_readme_reports_what_the_first_commands_learn_with():
 
 
 def test_studies_of_two_configs_are_not_one_row():
-    row = readme_table.ROWS[0]._replace(studies=("cartpole-rounds", "cartpole_network-rounds"))
+    row = readme_table.ROWS[0]._replace(studies=("cartpole-50", "cartpole_network-50"))
     with pytest.raises(ValueError, match="not of one config"):
         readme_table.pooled(row, RESULTS)
 
