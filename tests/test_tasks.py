@@ -114,7 +114,7 @@ def test_a_tiny_trial_through_the_command_line(words: list[str], tmp_path: Path)
 def test_a_mechanism_of_ones_own_is_five_and_takes_the_steps_that_its_coordinates_need() -> None:
     """`model=lagrangian` on a user's plant; three coordinates are integrated as with substeps=4, and not with 1."""
     own = config_io.parse({"task": "gym", "model": "lagrangian", "rates": "[2,3]"})
-    assert (own.model.ensemble_size, own.model.substeps, own.fit.steps, own.search.particles) == (5, None, 1000, 50)
+    assert (own.model.ensemble_size, own.model.substeps, own.fit.steps) == (5, None, 1000)
     task, x, u = tasks.make("double_cartpole"), jnp.array([0.1, 0.2, 3.0, -4.0, 2.0, 1.0]), jnp.array([5.0])
     data = Dataset(jnp.ones((4, 6)), jnp.ones((4, 1)), jnp.arange(24.0).reshape(4, 6), jnp.int32(4))
     changes = {}

@@ -140,8 +140,8 @@ def _network(**changes: Any) -> Change:
 def _lagrangian(config: Config) -> Config:
     assert isinstance(config.model, BNN)
     # Five mechanisms know what they do not know: docs/decisions.md 0036.
-    model, search = Lagrangian(initializer=config.model.initializer), replace(config.search, particles=50)
-    return replace(config, model=model, fit=Fit(steps=1000, learning_rate=3e-3), search=search)
+    model = Lagrangian(initializer=config.model.initializer)
+    return replace(config, model=model, fit=Fit(steps=1000, learning_rate=3e-3))
 
 
 def _dropout(rate: float) -> Change:
