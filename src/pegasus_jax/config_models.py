@@ -23,7 +23,7 @@ class _Network:
     """What every network model has, and an ensemble of them."""
 
     kind: str = setting("", "")
-    ensemble_size: int = setting(1, "networks fitted side by side; each particle follows one of them")
+    ensemble_size: int = setting(1, "models fitted side by side; each particle follows one of them")
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
     log_z_min: float = setting(-10.0, "lower end of the interval of log z (log_normal), whose upper end is 0")
@@ -57,7 +57,6 @@ class Lagrangian(_Network):
     """Dynamics of a mechanism whose energies are a Bayesian neural network, or an ensemble of them."""
 
     kind: str = setting("lagrangian", "")
-    ensemble_size: int = setting(5, "mechanisms fitted side by side; each particle follows one of them")
     hidden: tuple[int, ...] = setting((32, 32), "widths of the hidden layers")
     substeps: int | None = setting(
         None, "Runge-Kutta steps a control period; null: 1 for up to two coordinates, 4 for more, which may be chaotic"

@@ -32,7 +32,7 @@ from pegasus_jax.config import (
 
 CARTPOLE = Config(
     task="cartpole",
-    model=Lagrangian(ensemble_size=1, substeps=1),  # docs/decisions.md 0036
+    model=Lagrangian(substeps=1),  # one: docs/decisions.md 0036
     fit=Fit(steps=3000, learning_rate=3e-3),
     # docs/decisions.md 0014, 0015 and 0029.
     search=Search(particles=50, standardized_noise=True, refine_fraction=0.5),
@@ -42,7 +42,7 @@ CARTPOLE = Config(
 DOUBLE_CARTPOLE = Config(
     task="double_cartpole",
     trials=40,
-    model=Lagrangian(ensemble_size=1, substeps=4),
+    model=Lagrangian(substeps=4),
     policy=MLP(hidden=(50,) * 4, input_units=(1.0, 3.0, 6.0, 8.0)),
     fit=Fit(steps=5000, learning_rate=3e-3, decay=0.03),
     search=Search(
@@ -140,7 +140,7 @@ def _network(**changes: Any) -> Change:
 def _lagrangian(config: Config) -> Config:
     assert isinstance(config.model, BNN)
     # Five mechanisms know what they do not know: docs/decisions.md 0036.
-    model = Lagrangian(initializer=config.model.initializer)
+    model = Lagrangian(initializer=config.model.initializer, ensemble_size=5)
     return replace(config, model=model, fit=Fit(steps=1000, learning_rate=3e-3))
 
 
