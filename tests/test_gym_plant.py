@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import subprocess
 import sys
@@ -33,10 +34,11 @@ def balanced(x):  # InvertedDoublePendulum-v5: cart, sin x2, cos x2, rates, forc
 """
 
 
-def train(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+def train(*words: object, cwd: Path, **variables: str) -> subprocess.CompletedProcess[str]:
     (cwd / "costs.py").write_text(COSTS)
     program = [sys.executable, "-P", "-c", "from pegasus_jax.cli.main import train; train()", "task=gym"]
-    return subprocess.run([*program, *map(str, words)], cwd=cwd, capture_output=True, text=True, check=False)
+    given = dict(cwd=cwd, capture_output=True, text=True, check=False, env=os.environ | variables)
+    return subprocess.run([*program, *map(str, words)], **given)  # type: ignore[call-overload]
 
 
 @pytest.mark.parametrize(
@@ -64,6 +66,18 @@ def test_an_environment_not_written_for_us(env: str, cost: str, states: int, lim
         assert (steps == 8) == (ran.ended == "horizon")
         assert np.all(np.abs(ran.trajectory.u) <= limit)
     assert config_io.load(tmp_path / "run" / "config.yaml").env == env
+
+
+@pytest.mark.slow
+def test_pytorch_may_be_half_imported_while_a_search_compiles(tmp_path: Path) -> None:
+    """TensorBoard's writer imports it where it is there; SciPy, in the compiler's thread, would ask it for a Tensor."""
+    (package := tmp_path / "slow" / "torch").mkdir(parents=True)
+    (package / "__init__.py").write_text("import time\nprint('importing')\ntime.sleep(4)\nclass Tensor: pass\n")
+    words = ["env=Pendulum-v1", "cost=costs:upright", "horizon=8", *TINY, "eval_episodes=0", "out=run"]
+    path = os.pathsep.join([str(package.parent), os.environ.get("PYTHONPATH", "")])
+    done = train(*words, cwd=tmp_path, PYTHONPATH=path)
+    assert "importing" in done.stdout + done.stderr
+    assert done.returncode == 0, done.stderr
 
 
 def task_of(env: str, states: int, horizon: int = 9, low: float = -2.0, high: float = 2.0) -> Task:

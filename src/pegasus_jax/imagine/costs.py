@@ -31,6 +31,8 @@ __all__ = [
 OfState = Callable[[Array], Array]  # x [D] -> scalar
 Error = Callable[[Array], Array]  # x [D] -> e [E], affine in the features of x
 
+NODES = 512  # at which a cost whose expectation has no closed form is looked at
+
 
 def saturating(error: Error, width: Array | float, angles: tuple[int, ...]) -> Cost:
     """The cost 1 - exp(-|error(x)|^2 / (2 width^2)) of a state x [D] (Deisenroth 2010; docs/reference.md 1.3).
@@ -96,18 +98,22 @@ def expectation(cost: Cost) -> Callable[[Array, Array], Array]:
     return cost.expected or expected_by_nodes(cost.of_state)
 
 
-def expected_by_nodes(of_state: OfState, *, nodes: int = 512) -> Callable[[Array, Array], Array]:
+def expected_by_nodes(of_state: OfState, *, nodes: int = NODES) -> Callable[[Array, Array], Array]:
     """The expectation of any cost of a Gaussian state x [D]: the mean over as many fixed nodes, at least 2 D.
 
     Quasi-Monte Carlo with `normal_nodes`: exact for a cost that is a constant, linear or quadratic in x.
     """
 
     def expected(mean: Array, cov: Array) -> Array:
-        states = mean.shape[0]
-        z = normal_nodes(max(nodes, 2 * states), states)
+        z = nodes_for(mean.shape[0], nodes)
         return jnp.mean(jax.vmap(of_state)(mean + z.astype(mean.dtype) @ cholesky(cov).T))
 
     return expected
+
+
+def nodes_for(states: int, nodes: int = NODES) -> np.ndarray:
+    """The nodes [N, D] of an expectation over so many states; computed once."""
+    return normal_nodes(max(nodes, 2 * states), states)
 
 
 @lru_cache(maxsize=8)
@@ -116,6 +122,8 @@ def normal_nodes(count: int, size: int) -> np.ndarray:
 
     The normal's quantiles of Sobol's sequence, each moved to the middle of its interval, as none may be at 0.
     """
+    # Never first in a thread beside another that imports PyTorch, as trackers do: SciPy asks for what a half-imported
+    # one has not got yet. See runs/job.py.
     from scipy.stats import norm, qmc  # slow to import, and only a cost of one's own needs them
 
     intervals = 2 ** (count - 1).bit_length()

@@ -14,13 +14,14 @@ from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import build, capacity, compose, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import Experiment
+from pegasus_jax.imagine import costs
 from pegasus_jax.learn.data import grow
 from pegasus_jax.runs import first, restore, traced, writers
 from pegasus_jax.runs.display import Display
 from pegasus_jax.runs.logged import NONE, Logs
 from pegasus_jax.runs.programs import Program, is_main_process
 from pegasus_jax.runs.writers import Writer
-from pegasus_jax.types import RunState
+from pegasus_jax.types import Cost, RunState
 
 
 class Job(NamedTuple):
@@ -68,9 +69,11 @@ def first_states(job: Job, stored: RunState | None = None, changed: bool = False
     With `changed` settings of fit or search the optimizers may have to start again. The search, which takes longest
     to compile, begins to be compiled here.
     """
-    config = job.config
+    config, task = job.config, job.experiment.task
     done = 0 if stored is None else int(stored.trial[0])
     if max(done + 1, config.explore.trials) <= config.trials:  # else no policy is searched
+        if isinstance(task.cost, Cost) and task.cost.expected is None:
+            costs.nodes_for(len(task.state_names) + len(task.memory.names))  # not in the compiler's thread
         job.program.prepare("search")
     keys = jnp.stack([jax.random.key(seed) for seed in job.seeds])
     if stored is None:
@@ -79,7 +82,7 @@ def first_states(job: Job, stored: RunState | None = None, changed: bool = False
         states = restore.suited(stored, job.program("init", keys))
     else:
         states = stored
-    rows = capacity(config, job.experiment.task, job.logs.rows)
+    rows = capacity(config, task, job.logs.rows)
     if rows > states.data.x.shape[1]:
         states = states._replace(data=jax.vmap(partial(grow, capacity=rows))(states.data))
     return states
