@@ -49,7 +49,7 @@ def test_the_cart_pole_is_solved_when_nine_of_ten_episodes_end_upright(failing: 
 
 def test_pendulum_is_judged_by_its_own_return() -> None:
     env = gymnasium.make("Pendulum-v1")
-    totals, _ = returns(lambda x: np.zeros(1), env, 10)
+    totals, _ = returns(lambda x: np.zeros(1), env, 10, 10)
     found = judge(lambda x: 0.0, env, PLANTS["pendulum"])
     assert any(found == pytest.approx(np.mean(totals[:count]), abs=1e-3) for count in range(1, 11))
     assert found < PLANTS["pendulum"].bar

@@ -48,7 +48,6 @@ def test_episodes_end_where_their_user_says(name: str) -> None:
         ("Pendulum-v1", [1, 0, 0]),
         ("InvertedPendulum-v5", [0, 0, 0, 0]),
         ("InvertedDoublePendulum-v5", [0, 0, 0, 1, 1, 0, 0, 0, 0]),
-        ("Reacher-v5", [1, 1, 0, 0, 0.2, 0, 0, 0, 0, 0]),
         ("CartPole", [0, 0, 0, np.pi]),
     ],
 )
@@ -70,7 +69,7 @@ def test_the_cart_pole_is_the_projects_own() -> None:
 def test_native_returns_are_those_of_the_environment() -> None:
     """A controller that does nothing, against the environment's own reward, again with the same resets."""
     env = gymnasium.make("Pendulum-v1")
-    totals, lengths = returns(lambda x: np.zeros(1), env, 2)
+    totals, lengths = returns(lambda x: np.zeros(1), env, 2, 2)
     assert lengths == [200, 200]
     env.reset(seed=10_001)
     assert totals[1] == pytest.approx(sum(env.step(np.zeros(1, np.float32))[1] for _ in range(200)), abs=1e-3)
@@ -99,7 +98,7 @@ def test_one_seed_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert (run["plant"], run["seed"], run["error"]) == ("Pendulum-v1", 100, None)
     (row,) = run["trials"]
     assert row["native"] == pytest.approx(np.mean(row["returns"]), abs=1e-3)
-    assert len(row["returns"]) == 10
+    assert len(row["returns"]) == 50
     assert row["plant_seconds"] == pytest.approx(2)
     assert "Pendulum-v1" in capsys.readouterr().out
 
