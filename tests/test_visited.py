@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from pegasus_jax.assembly.experiments import compose
-from pegasus_jax.imagine.visited import STATES, Starts, Visited, beside_visited, remember, remembering, started
+from pegasus_jax.imagine import visited
+from pegasus_jax.imagine.rollout import limited
+from pegasus_jax.imagine.visited import STATES, Starts, Visited, beside_visited, longest, remember, remembering, started
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.types import Dataset, RunState, Scenarios, TrainState
 from pegasus_jax.vectorized import for_particles
@@ -30,14 +32,14 @@ def run_state(data, succeeded=True):
 
 def drawn(share, states, angles=(), around=0.0, succeeded=True):
     start = beside_visited(lambda key, given: jnp.full((K, D), -5.0), share, angles, jnp.full(D, around))
-    found = start(jax.random.key(0), Visited(None, states, jnp.bool_(succeeded)))
+    found = start(jax.random.key(0), Visited(None, states, jnp.ones(D), jnp.bool_(succeeded)))
     assert np.array_equal(found.own, np.full((K, D), -5.0))
     return np.asarray(found.mixed)
 
 
 @pytest.mark.parametrize("size", [1, 7, STATES, 600])
 def test_the_states_are_the_rows_in_use_evenly(size):
-    kept = np.asarray(remember(None, run_state(rows(size))).states)
+    kept = np.asarray(remember(None, run_state(rows(size)), angles=()).states)
     assert kept.shape == (STATES, D)
     places, counts = np.unique(kept[:, 0], return_counts=True)
     assert len(places) == min(size, STATES)
@@ -61,7 +63,49 @@ def test_so_large_a_share_starts_there(share):
 
 def test_before_a_success_nothing_starts_there():
     assert np.array_equal(drawn(1.0, jnp.zeros((STATES, D)), succeeded=False), np.full((K, D), -5.0))
-    assert not bool(remember(None, run_state(rows(3), succeeded=False)).succeeded)
+    assert not bool(remember(None, run_state(rows(3), succeeded=False), angles=()).succeeded)
+
+
+def walked(scale, turns=0.0):
+    """The spread of 600 rows of a plant whose states are counted in other units, and whose second entry is an angle."""
+    x = np.random.default_rng(0).normal(size=(600, D)) * [1.0, 0.3, 0.0] + [0, 3.0, 5.0]
+    x[:, 1] += turns * np.arange(600)
+    data = rows(600, 600)._replace(x=jnp.asarray(x * [scale, 1.0, 1.0], jnp.float32))
+    return remember(None, run_state(data), angles=(1,))
+
+
+def test_the_spread_is_that_of_the_states_whatever_turns_an_angle_has_made():
+    np.testing.assert_allclose(walked(1.0).spread, [1.0, 0.3, 0.0], rtol=0.1, atol=1e-6)
+    np.testing.assert_allclose(walked(1.0, turns=2 * np.pi).spread, walked(1.0).spread, rtol=1e-2, atol=1e-4)
+
+
+@pytest.mark.parametrize("steepest", [8.0, 12.0])
+def test_what_is_dropped_does_not_depend_on_the_unit_of_a_state(steepest):
+    """A cost of K particles that falls by `steepest` where one moves by the spread, in m and in mm; 10 is the most."""
+
+    def gradient(scale):
+        given = walked(scale)
+        x = jnp.zeros((K, D))
+        slope = jnp.array([steepest, 0.0, 1e6]) / jnp.where(
+            given.spread == 0, 1, given.spread
+        )  # the last never changes
+        return np.asarray(jax.grad(lambda x: jnp.mean(limited(x, longest(given, K)) @ slope))(x))[:, 0]
+
+    metres, millimetres = gradient(1.0), gradient(1000.0)
+    assert np.all((metres != 0) == (steepest < 10))
+    np.testing.assert_allclose(metres, 1000 * millimetres, rtol=1e-4)
+
+
+def test_a_search_on_a_plant_of_ones_own_drops_what_is_too_steep(monkeypatch):
+    def norm(steepest):
+        monkeypatch.setattr(visited, "STEEPEST", steepest)
+        experiment = compose(tiny(search__visited_starts=0.5, search__refine_fraction=0.5, search__steps=4), cart())
+        state = experiment.init(jax.random.key(0))
+        state = experiment.add_episode(state, experiment.collect(state))
+        return float(experiment.search(state)[1].gradient_norm[0])
+
+    assert norm(1e-3) < 0.9 * norm(1e6)
+    assert norm(1e6) == pytest.approx(norm(1e9))
 
 
 def test_angles_are_those_near_the_starts_whatever_turns_the_plant_made():
@@ -80,7 +124,7 @@ def test_a_model_that_remembers_predicts_as_before(members):
     @partial(jax.jit, static_argnums=(0, 1))
     def predicted(one, remembered):
         posterior = one.posterior(model.init(jax.random.key(1)), data)
-        posterior = remember(posterior, run_state(data)) if remembered else posterior
+        posterior = remember(posterior, run_state(data), angles=()) if remembered else posterior
         keys = jax.random.split(jax.random.key(2), 6)
         draws = jax.vmap(one.sample, (0, None))(keys, posterior) if one.deal is None else one.deal(keys, posterior)
         alone = one.apply(posterior, jax.tree.map(lambda leaf: leaf[0], draws), data.x[0], data.u[0])

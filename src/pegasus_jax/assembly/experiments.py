@@ -81,7 +81,7 @@ def compose(
         search_steps=config.search.steps,
         imagine=searching.imagine,
         expect=searching.expect if visits else None,
-        remember=visited.remember if visits else None,
+        remember=partial(visited.remember, angles=task.angles) if visits else None,
         explore=explore_of(config.explore, task),
         explore_trials=config.explore.trials,
         first_search=settings.first_search(config) if task.prior is None else config.explore.trials,

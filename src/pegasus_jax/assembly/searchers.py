@@ -16,7 +16,7 @@ from pegasus_jax.imagine import limits as limited
 from pegasus_jax.imagine import matching, scenarios
 from pegasus_jax.imagine.objective import either, objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
-from pegasus_jax.imagine.visited import beside_visited, started
+from pegasus_jax.imagine.visited import beside_visited, longest, started
 from pegasus_jax.learn.multistart import best_of
 from pegasus_jax.learn.schedule import SearchTable, search_table
 from pegasus_jax.learn.search import Problem, searcher
@@ -118,14 +118,16 @@ def search_of(
     def value(params: Params, posterior: Params, given: Scenarios, row: SearchTable, *weight: Array) -> Any:
         # What no row asks for is not compiled.
         refining, widens = row.refine if refines else None, (table().cost_width != 1).any() or table().holds.any()
-        given = started(given, row.refine) if search.visited_starts else given
+        short = None if limit is None else limit * row.limit
+        if search.visited_starts:
+            given, short = started(given, row.refine), longest(posterior, search.particles) if limit is None else short
         return objective_of(
             params,
             posterior,
             given,
             *weight,
             **pieces,
-            limit=None if limit is None else limit * row.limit,
+            limit=short,
             match=either(refining, matching.keep, match),  # what refines has no matching, and each particle's own cost
             cost=costs(refining, row.cost_width if widens else None),
         )

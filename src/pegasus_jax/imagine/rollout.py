@@ -77,7 +77,7 @@ def rollout(
 
 
 def limited(x: Array, limit: Array | float) -> Array:
-    """x [K, D] itself, whose gradient is dropped in the rows where it is longer than `limit`, or not finite.
+    """x [K, D] itself, whose gradient is dropped in the rows where it is longer than `limit`, [] or [D], or not finite.
 
     On a plant that is chaotic the gradient of one particle can be 1e9 times that of the others: summed up, it would
     drown them, and shortened, its direction would still be one of chance. Without it a particle answers for the
@@ -85,8 +85,8 @@ def limited(x: Array, limit: Array | float) -> Array:
     """
 
     def short(limit: Array, gradient: Array) -> tuple[Array, Array]:
-        square = jnp.sum(gradient**2, -1, keepdims=True)
-        return jnp.where(square <= limit**2, gradient, 0.0), jnp.zeros_like(limit)  # NaN is not
+        square = jnp.sum((gradient / limit) ** 2, -1, keepdims=True)
+        return jnp.where(square <= 1, gradient, 0.0), jnp.zeros_like(limit)  # NaN is not
 
     same = jax.custom_vjp(lambda x, limit: x)
     same.defvjp(lambda x, limit: (x, limit), short)

@@ -17,6 +17,7 @@ from pegasus_jax.types import Array, Dynamics, Key, Params, Prediction, RunState
 from pegasus_jax.vectorized import Vectorized, for_particles
 
 STATES = 512  # that a posterior carries: as many for any number of trials, so that a search compiles once
+STEEPEST = 10.0  # docs/decisions.md 0038
 _VISITED = 1  # what the key of the start block is folded with
 
 
@@ -25,13 +26,24 @@ class Visited(NamedTuple):
 
     posterior: Any
     states: Array  # [512, D + M]
+    spread: Array  # [D + M] the standard deviations of the states
     succeeded: Array  # [] bool, whether the newest episode did
 
 
-def remember(posterior: Any, state: RunState) -> Visited:
+def remember(posterior: Any, state: RunState, *, angles: tuple[int, ...]) -> Visited:
     """The posterior with rows evenly spaced in a run's data, repeated where it has few."""
     rows = jnp.arange(STATES) * state.data.size // STATES
-    return Visited(posterior, join(state.data.x, state.data.memory)[rows], state.succeeded)
+    states = join(state.data.x, state.data.memory)[rows]
+    return Visited(posterior, states, jnp.std(difference(states, states[0], angles), 0), state.succeeded)
+
+
+def longest(given: Visited, particles: int) -> Array:
+    """How long [D + M] the gradient of one of so many particles with respect to its state may sensibly be.
+
+    To move a particle by the states' spread changes its cost, which is in [0, 1], by 1 at most. Where a gradient says
+    `STEEPEST` times that, its particle is chaotic there.
+    """
+    return STEEPEST / (particles * given.spread)
 
 
 def remembering(dynamics: Dynamics) -> Dynamics:
