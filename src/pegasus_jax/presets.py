@@ -30,12 +30,16 @@ from pegasus_jax.config import (
     Search,
 )
 
+# A plant of few dimensions needs no more, and narrow layers larger steps: docs/decisions.md 0037.
+SMALL_POLICY, SMALL_POLICY_STEP = MLP(hidden=(64, 64)), 3e-3
+
 CARTPOLE = Config(
     task="cartpole",
     model=Lagrangian(substeps=1),  # one: docs/decisions.md 0036
     fit=Fit(steps=3000, learning_rate=3e-3),
+    policy=SMALL_POLICY,
     # docs/decisions.md 0014, 0015 and 0029.
-    search=Search(particles=50, standardized_noise=True, refine_fraction=0.5),
+    search=Search(particles=50, learning_rate=SMALL_POLICY_STEP, standardized_noise=True, refine_fraction=0.5),
 )
 
 # docs/decisions.md 0006, 0008, 0009 and 0011.
@@ -96,7 +100,17 @@ def swimmer(maneuver: str, legs: int) -> Config:
 
 # The expectation of a cost of one's own is a mean over nodes: docs/decisions.md 0018. Such a plant may start anywhere:
 # 0024. It is to hold for longer than an episode: 0023.
-_OWN_PLANT = Search(standardized_noise=True, refine_fraction=0.5, matching="narrow", visited_starts=0.5)
+_OWN_PLANT = Config(
+    model=BNN(hidden=(100, 100)),
+    policy=SMALL_POLICY,
+    search=Search(
+        learning_rate=SMALL_POLICY_STEP,
+        standardized_noise=True,
+        refine_fraction=0.5,
+        matching="narrow",
+        visited_starts=0.5,
+    ),
+)
 
 _SWIMMERS = {
     **{f"swimmer_{name}": swimmer(name, 2) for name in MANEUVERS},
@@ -105,8 +119,12 @@ _SWIMMERS = {
 
 # With a Bayesian neural network as the paper has it: what `model=` and the paper's algorithms change.
 NETWORKS: dict[str, Config] = {
-    "cartpole_network": replace(
-        CARTPOLE, model=BNN(), fit=Fit(), search=replace(CARTPOLE.search, particles=Search.particles)
+    "cartpole_network": replace(  # the paper's sizes
+        CARTPOLE,
+        model=BNN(),
+        fit=Fit(),
+        policy=MLP(),
+        search=replace(CARTPOLE.search, particles=Search.particles, learning_rate=Search.learning_rate),
     ),
     "double_cartpole_network": DOUBLE_CARTPOLE_NETWORK,
     **{
@@ -125,8 +143,8 @@ PRESETS: dict[str, Config] = {
     ),
     **_SWIMMERS,
     # A robot runs a new policy only where it is expected to be better than the one before.
-    GYM: Config(task=GYM, search=_OWN_PLANT, successor="better"),
-    MJCF: Config(task=MJCF, search=_OWN_PLANT),
+    GYM: replace(_OWN_PLANT, task=GYM, successor="better"),
+    MJCF: replace(_OWN_PLANT, task=MJCF),
     **NETWORKS,
 }
 
@@ -171,13 +189,15 @@ POLICIES: dict[str, Change] = {
 
 
 def _papers(config: Config, **search: Any) -> Config:
-    """The paper's network, dropout in the policy and step size of the fit, with a search that follows each particle."""
+    """The paper's network, dropout in the policy and step sizes, with a search that follows each particle."""
     model, fit = config.model, config.fit
+    assert isinstance(config.search, Search)
     if isinstance(model, BNN | Lagrangian):
         model = replace(model, activation="relu", kl_weight=1.0)
     if isinstance(fit, Fit):
         fit = replace(fit, learning_rate=1e-4)
     plain = dict(
+        learning_rate=min(config.search.learning_rate, Search.learning_rate),
         cost_estimator="particles",
         cost_width_start=1.0,
         matching="always",
