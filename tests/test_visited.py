@@ -97,14 +97,24 @@ def test_what_is_dropped_does_not_depend_on_the_unit_of_a_state(steepest):
 
 
 def test_a_search_on_a_plant_of_ones_own_drops_what_is_too_steep(monkeypatch):
-    def norm(steepest):
+    """A cost that is a thousand times as high at the start as it should be loses nothing for that."""
+
+    def norm(steepest, factor=1.0):
         monkeypatch.setattr(visited, "STEEPEST", steepest)
-        experiment = compose(tiny(search__visited_starts=0.5, search__refine_fraction=0.5, search__steps=4), cart())
+        task = cart()
+        experiment = compose(
+            tiny(
+                search__visited_starts=0.5, search__refine_fraction=0.5, search__steps=4, search__cost_width_start=1.0
+            ),
+            task,
+            cost=lambda x: factor * (1 + task.cost.of_state(x)),
+        )
         state = experiment.init(jax.random.key(0))
         state = experiment.add_episode(state, experiment.collect(state))
         return float(experiment.search(state)[1].gradient_norm[0])
 
-    assert norm(1e-3) < 0.9 * norm(1e6)
+    assert norm(1e-3) < 0.9 * norm(10.0)
+    assert norm(10.0, 1000.0) == pytest.approx(1000 * norm(10.0), rel=1e-3)
 
 
 def test_angles_are_those_near_the_starts_whatever_turns_the_plant_made():

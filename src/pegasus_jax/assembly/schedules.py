@@ -43,21 +43,29 @@ def rounds_from(refine: int, steps: int, most: int) -> list[int]:
 
 def width_of(search: settings.Search, task: Task) -> float:
     """The factor of the cost's width with which a search begins: as configured, or what the task's starts ask for."""
-    if search.cost_width_start is not None:
-        return search.cost_width_start
+    return width_for(at_starts(task)) if search.cost_width_start is None else search.cost_width_start
+
+
+def scale_of(task: Task) -> float:
+    """The largest cost where episodes start, if it is above 1, where a cost should end."""
+    return max(1.0, float(np.max(at_starts(task))))
+
+
+def at_starts(task: Task) -> np.ndarray:
+    """The costs [256] of states with which episodes start."""
 
     def first(x: Array, key: Key) -> Array:
         return costs.of(task.cost, join(x, begin(task.memory, key, x)))
 
     with jax.ensure_compile_time_eval():
         x, keys = jnp.asarray(examples(task, STARTS)), jax.random.split(jax.random.key(0), STARTS)
-        return width_for(np.asarray(jax.vmap(first)(x, keys)))
+        return np.asarray(jax.vmap(first)(x, keys))
 
 
-def width_for(at_starts: np.ndarray) -> float:
-    """The factor by which a cost is to be `widened` that is `at_starts` [N] in [0, 1] where episodes start.
+def width_for(found: np.ndarray) -> float:
+    """The factor by which a cost is to be `widened` that is `found` [N] in [0, 1] where episodes start.
 
     With it their mean is at most `SEEN`, so that a search sees a slope towards the goal; 1 where that is so already.
     """
-    rest = np.clip(1 - np.mean(at_starts, dtype=np.float64), LEAST_REST, 1)
+    rest = np.clip(1 - np.mean(found, dtype=np.float64), LEAST_REST, 1)
     return max(1.0, float(np.sqrt(np.log(rest) / np.log(1 - SEEN))))

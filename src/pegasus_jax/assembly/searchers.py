@@ -9,7 +9,7 @@ import optax
 
 from pegasus_jax import config as settings
 from pegasus_jax import tasks
-from pegasus_jax.assembly.schedules import table_of, width_of
+from pegasus_jax.assembly.schedules import scale_of, table_of, width_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import limits as limited
@@ -115,12 +115,17 @@ def search_of(
     def table() -> SearchTable:
         return table_of(search, width_of(search, task))
 
+    @cache
+    def scale() -> float:
+        return scale_of(task)
+
     def value(params: Params, posterior: Params, given: Scenarios, row: SearchTable, *weight: Array) -> Any:
         # What no row asks for is not compiled.
         refining, widens = row.refine if refines else None, (table().cost_width != 1).any() or table().holds.any()
         short = None if limit is None else limit * row.limit
         if search.visited_starts:
-            given, short = started(given, row.refine), longest(posterior, search.particles) if limit is None else short
+            given = started(given, row.refine)
+            short = scale() * longest(posterior, search.particles) if limit is None else short
         return objective_of(
             params,
             posterior,

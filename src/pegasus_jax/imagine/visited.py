@@ -38,7 +38,7 @@ def remember(posterior: Any, state: RunState, *, angles: tuple[int, ...]) -> Vis
 
 
 def longest(given: Visited, particles: int) -> Array:
-    """How long [D + M] the gradient of one of so many particles with respect to its state may sensibly be.
+    """How long [D + M] the gradient of one of so many particles with respect to its state may be.
 
     To move a particle by the states' spread changes its cost, which is in [0, 1], by 1 at most. Where a gradient says
     `STEEPEST` times that, its particle is chaotic there.
