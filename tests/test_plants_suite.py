@@ -66,6 +66,20 @@ def test_the_cart_pole_is_the_projects_own() -> None:
         assert cost(jnp.asarray(info["x"])) == pytest.approx(info["cost"], abs=1e-5)
 
 
+def test_reachers_cost_is_of_what_its_reward_takes_off() -> None:
+    """From the angles and the target alone, in any posture: the distance that the plant itself observes."""
+    cost, env = function("Reacher-v5", "cost"), gymnasium.make("Reacher-v5")
+    env.action_space.seed(0)
+    env.reset(seed=0)
+    for _ in range(20):
+        u = env.action_space.sample()
+        x, *_ = env.step(u)
+        lost = np.hypot(x[8], x[9]) + np.sum(u**2)
+        assert cost(jnp.asarray(x[:8], float), jnp.asarray(u)) == pytest.approx(-np.expm1(-lost / 0.1), abs=1e-3)
+    goal = jnp.array([1, 1, 0, 0, 0.21, 0, 0, 0], float)
+    assert cost(goal, jnp.zeros(2)) == pytest.approx(0, abs=0.011)  # rounded, so that the slope is finite there
+
+
 def test_native_returns_are_those_of_the_environment() -> None:
     """A controller that does nothing, against the environment's own reward, again with the same resets."""
     env = gymnasium.make("Pendulum-v1")

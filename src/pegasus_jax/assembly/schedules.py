@@ -1,5 +1,7 @@
 """Which table the settings of a search and the starts of a task ask for."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,14 +43,12 @@ def rounds_from(refine: int, steps: int, most: int) -> list[int]:
     return [refine + (steps - refine) * number // rounds for number in range(rounds)]
 
 
-def width_of(search: settings.Search, task: Task) -> float:
-    """The factor of the cost's width with which a search begins: as configured, or what the task's starts ask for."""
-    return width_for(at_starts(task)) if search.cost_width_start is None else search.cost_width_start
+def width_of(search: settings.Search, begun: Callable[[], np.ndarray]) -> float:
+    """The factor of the cost's width with which a search begins: as configured, or what the costs `begun` [N] ask for.
 
-
-def scale_of(task: Task) -> float:
-    """The largest cost where episodes start, if it is above 1, where a cost should end."""
-    return max(1.0, float(np.max(at_starts(task))))
+    They are asked for only where they decide.
+    """
+    return width_for(begun()) if search.cost_width_start is None else search.cost_width_start
 
 
 def at_starts(task: Task) -> np.ndarray:
@@ -60,6 +60,11 @@ def at_starts(task: Task) -> np.ndarray:
     with jax.ensure_compile_time_eval():
         x, keys = jnp.asarray(examples(task, STARTS)), jax.random.split(jax.random.key(0), STARTS)
         return np.asarray(jax.vmap(first)(x, keys))
+
+
+def scale_for(found: np.ndarray) -> float:
+    """The largest of the costs `found` [N] where episodes start, if that is above 1, where a cost should end."""
+    return max(1.0, float(np.max(found)))
 
 
 def width_for(found: np.ndarray) -> float:

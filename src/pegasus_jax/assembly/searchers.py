@@ -9,7 +9,7 @@ import optax
 
 from pegasus_jax import config as settings
 from pegasus_jax import tasks
-from pegasus_jax.assembly.schedules import scale_of, table_of, width_of
+from pegasus_jax.assembly.schedules import at_starts, scale_for, table_of, width_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import limits as limited
@@ -111,13 +111,11 @@ def search_of(
     costs = costs_of(search, task)
     refines = search.refine_fraction > 0
 
-    @cache
-    def table() -> SearchTable:
-        return table_of(search, width_of(search, task))
+    begun = cache(partial(at_starts, task))
 
     @cache
-    def scale() -> float:
-        return scale_of(task)
+    def table() -> SearchTable:
+        return table_of(search, width_of(search, begun))
 
     def value(params: Params, posterior: Params, given: Scenarios, row: SearchTable, *weight: Array) -> Any:
         # What no row asks for is not compiled.
@@ -125,7 +123,7 @@ def search_of(
         short = None if limit is None else limit * row.limit
         if search.visited_starts:
             given = started(given, row.refine)
-            short = scale() * longest(posterior, search.particles) if limit is None else short
+            short = scale_for(begun()) * longest(posterior, search.particles) if limit is None else short
         return objective_of(
             params,
             posterior,

@@ -1,6 +1,7 @@
 """pegasus-check: what a task is like, and what would go wrong, before anything moves; pegasus-train asks it first."""
 
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -199,9 +200,9 @@ def report(config: Config) -> list[str]:
 
 def widened(config: Config, task: Task) -> str:
     """How much wider the cost is where a search begins, if it is."""
-    from pegasus_jax.assembly.schedules import width_of
+    from pegasus_jax.assembly.schedules import at_starts, width_of
 
-    width = width_of(config.search, task) if isinstance(config.search, Search) else 1.0
+    width = width_of(config.search, partial(at_starts, task)) if isinstance(config.search, Search) else 1.0
     return f"; searches begin with a cost {width:.2g} times as wide" if width > 1.05 else ""
 
 
