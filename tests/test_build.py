@@ -23,7 +23,8 @@ from pegasus_jax.pilco.ssgp import ssgp
 from pegasus_jax.policies.squash import SQUASHES
 from pegasus_jax.presets import ALGORITHMS, MODELS, POLICIES
 from pegasus_jax.runs import config_io
-from pegasus_jax.types import Cost, TrainState
+from pegasus_jax.tasks.remembered import remembering
+from pegasus_jax.types import Cost, Dataset, TrainState
 from probes import PENDULUM, SCALAR, cart, dial, known, linear_policy, same, tiny
 
 
@@ -101,6 +102,35 @@ def test_a_policy_counts_in_the_units_it_is_given():
         policy_of(config.MLP(input_units=(1.0,)), task)
     with pytest.raises(ConfigError, match=r"policy.input_units=0 is out of range"):
         config.MLP(input_units=(1.0, 0.0, 1.0))
+
+
+def test_a_policy_counts_earlier_controls_in_their_own_range():
+    """Told in N or in mN, forces of before move a fresh policy alike; what was learned with another input keeps it."""
+    words = {"task": "cartpole", "sensors.measured": "[0,3]", "sensors.velocity": "difference", "sensors.delay": "1"}
+    given = config_io.parse(words)
+
+    def policy(factor):
+        task = tasks.of_config(given)
+        task = task._replace(control_low=task.control_low * factor, control_high=task.control_high * factor)
+        return policy_of(given.policy, remembering(given, task))
+
+    def seen(factor, rows=20):
+        """[x, theta, two earlier forces, their rates]"""
+        x = jax.random.normal(jax.random.key(1), (rows, 6))
+        return x.at[:, 2:4].multiply(5.0 * factor)
+
+    newtons, small = policy(1.0), policy(1000.0)
+    params, of_small = newtons.init(jax.random.key(0)), small.init(jax.random.key(0))
+    act = lambda policy, params, x: jax.vmap(lambda x: policy.apply(params, None, x))(x)  # noqa: E731
+    expected = act(newtons, params, seen(1.0))
+    np.testing.assert_allclose(act(small, of_small, seen(1000.0)) / 1000, expected, rtol=1e-4, atol=1e-5)
+    data = Dataset(seen(1000.0), jnp.zeros((20, 1)), jnp.zeros((20, 4)), jnp.int32(20))
+    adapted = small.adapt(of_small, data)
+    np.testing.assert_allclose(act(small, adapted, seen(1000.0)) / 1000, expected, rtol=1e-4, atol=1e-5)
+    plain = of_small | {"input": of_small["input"]._replace(scale=jnp.ones(7))}
+    np.testing.assert_allclose(
+        act(small, plain, seen(1.0)) / 1000, act(newtons, plain, seen(1.0)), rtol=1e-4, atol=1e-5
+    )
 
 
 @pytest.mark.parametrize(

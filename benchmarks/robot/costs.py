@@ -35,7 +35,7 @@ from pegasus_jax.runs.train import learn
 
 HERE = "benchmarks.robot.asked"
 EPISODES = 20
-CART = ("task=cartpole", "search.cost_width_start=1", "trials=10")
+CART = ("task=cartpole", "trials=10")
 ARM = Path(__file__).parents[2] / "examples/own_mjcf.xml"
 REACHER = Path(gymnasium.__file__).parent / "envs/mujoco/assets/reacher.xml"
 ON_FILE = ("task=mjcf", "angles=[0,1]", "trials=8")

@@ -141,6 +141,7 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
                 dropout=dropout.binary(config.dropout) if config.dropout > 0 else dropout.none(),
                 initializer=config.initializer,
                 input_scale=tasks.input_scale(task, config.input_units),
+                units=tasks.control_units(task),
                 # Within a constraint a policy grows from one that hardly moves, and need not find its way back.
                 output_scale=1.0 if task.constraint is None else AT_REST,
             )

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from pegasus_jax.models.networks import MLP
-from pegasus_jax.policies.scaled import of_data, scaled, unscaled
+from pegasus_jax.policies.scaled import in_units, of_data, scaled
 from pegasus_jax.types import Array, Dataset, Dropout, Key, Params, Policy
 
 
@@ -21,12 +21,14 @@ def mlp(
     saturate: Callable[[Array], Array],
     initializer: str,
     input_scale: Array | float = 1.0,
+    units: Array | float = 1.0,
     output_scale: float = 1.0,
 ) -> Policy:
     """u [U] = saturate(network(encode(x [D]) * input_scale)); noise on hidden layers' outputs (docs/reference.md 5.1).
 
-    What the data have large is standardized on its way in, see `scaled`. The outgoing weights begin `output_scale`
-    times as large as usual: a small one begins with controls near the middle of their range.
+    A fresh network divides each input by its unit [F], and what the data have large is standardized: see `scaled`. Both
+    are kept with the parameters. The outgoing weights begin `output_scale` times as large as usual: a small one begins
+    with controls near the middle of their range.
     """
     network = MLP(hidden, controls, initializer)
 
@@ -37,10 +39,10 @@ def mlp(
             last = f"layer_{len(hidden)}"
             net["params"][last]["kernel"] *= output_scale
         noise = tuple(dropout.init(k, w) for k, w in zip(keys, hidden, strict=True))
-        return {"network": net, "noise": noise, "input": unscaled(features)}
+        return {"network": net, "noise": noise, "input": in_units(jnp.ones(features) * units)}
 
     def adapt(params: Params, data: Dataset) -> Params:
-        return params | {"input": of_data(encode(data.x) * input_scale, data.size)}
+        return params | {"input": of_data(encode(data.x) * input_scale, data.size, units)}
 
     def sample(key: Key) -> tuple[Array, ...]:
         keys = jax.random.split(key, len(hidden))

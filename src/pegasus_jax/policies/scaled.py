@@ -1,4 +1,4 @@
-"""A controller's inputs, standardized where the data have them so large that they would saturate it."""
+"""A controller's inputs, in units in which they are of order one: large ones would saturate it."""
 
 from typing import NamedTuple
 
@@ -18,17 +18,18 @@ class Input(NamedTuple):
     scale: Array  # [F]
 
 
-def unscaled(features: int) -> Input:
-    """The input that leaves so many features as they are."""
-    return Input(jnp.zeros(features), jnp.ones(features))
+def in_units(units: Array) -> Input:
+    """The input that divides features by these units [F]."""
+    return Input(jnp.zeros_like(units), units)
 
 
-def of_data(features: Array, size: Array) -> Input:
-    """The input for data whose first `size` rows of features [N, F] are in use.
+def of_data(features: Array, size: Array, units: Array | float = 1.0) -> Input:
+    """The input for data whose first `size` rows of features [N, F] are in use, each counted in its unit [F].
 
     A feature whose root mean square is more than LARGE has its mean subtracted and is divided by its standard
-    deviation, or by 1 where it is constant; the others are left as they are, to the last bit.
+    deviation, or by its unit where it is constant; the others are divided by their unit only.
     """
+    features = features / units
     used = (jnp.arange(features.shape[0]) < size)[:, None]
     count = jnp.maximum(size, 1).astype(features.dtype)
     rows = jnp.where(used, features, 0)
@@ -37,7 +38,7 @@ def of_data(features: Array, size: Array) -> Input:
     spread = jnp.sqrt(jnp.sum(jnp.where(used, rows - mean, 0) ** 2, 0) / count)
     large = size_of > LARGE
     scale = jnp.where(spread > CONSTANT * size_of, spread, 1)
-    return Input(jnp.where(large, mean, 0), jnp.where(large, scale, 1))
+    return Input(jnp.where(large, mean, 0) * units, jnp.where(large, scale, 1) * units)
 
 
 def scaled(given: Input, features: Array) -> Array:

@@ -111,6 +111,19 @@ def input_scale(task: Task, units: tuple[float, ...]) -> Any:
     return every if units or any(unit != 1 for unit in shown) else 1.0
 
 
+def control_units(task: Task) -> Any:
+    """The units of a policy's features [F]: of a control of before, half of the range of the control; 1 of the others.
+
+    A network whose inputs are forces of 10 N begins saturated by them: docs/decisions.md 0039.
+    """
+    half = (np.asarray(task.control_high, float) - np.asarray(task.control_low, float)) / 2
+    turning, shown = memory.seen_angles(task), memory.seen_names(task)
+    before = range(1, 1 + len(shown))
+    of = {name: unit for i in before for name, unit in zip(terms.past(task, i), half, strict=True)}
+    plain = [of.get(name, 1.0) for i, name in enumerate(shown) if i not in turning]
+    return np.array([*plain, *np.ones(2 * len(turning))])
+
+
 def resolve(config: Config) -> Config:
     """The config for a run's folder: it finds its MJCF file from anywhere.
 
