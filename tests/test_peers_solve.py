@@ -56,7 +56,7 @@ def test_pendulum_is_judged_by_its_own_return() -> None:
 
 
 def test_judging_is_on_no_clock_and_the_policy_in_hand_is_judged_when_time_is_over(tmp_path: Path) -> None:
-    attempt = Attempt(PLANTS["pendulum"], 0, 0.1, tmp_path / "rows")
+    attempt = Attempt(PLANTS["pendulum"], 0, 0.5, tmp_path / "rows")
     attempt.other = attempt.env.env
     attempt.at_end = lambda x: np.zeros(1)
     attempt.begin()
@@ -69,13 +69,13 @@ def test_judging_is_on_no_clock_and_the_policy_in_hand_is_judged_when_time_is_ov
             pass
         return np.zeros(1)
 
-    attempt.judged(lambda x: work(5e-4))
+    attempt.judged(lambda x: work(2.5e-3))
     with pytest.raises(SystemExit):
         work(5)
     first, last = (json.loads(line) for line in (tmp_path / "rows").read_text().splitlines())
     assert first["plant_seconds"] == last["plant_seconds"] == 2.0
     assert first["cpu_seconds"] < last["cpu_seconds"]
-    assert 0.09 < last["cpu_seconds"] < 0.2  # judging took .2 s and more
+    assert 0.45 < last["cpu_seconds"] < 0.95  # judging took 1 s and more; other threads of this process count too
 
 
 def run(program: str, seed: int, plant: float, cpu: float, solved: bool = True) -> dict[str, Any]:
