@@ -18,6 +18,7 @@ from benchmarks.robot.cartpole_by_hand import exact
 from benchmarks.robot.sensors import CARTPOLE
 from pegasus_jax import episode, tasks
 from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.study import seed_list
@@ -45,16 +46,14 @@ def known() -> Dynamics:
 def searched(config: Config, seeds: list[int], searches: int) -> list[list[tuple[float, float]]]:
     """(mean cost, success) after each search of each seed."""
     experiment = compose(config, tasks.of_config(config), dynamics=known())
-    run, search = jax.jit(experiment.episode), jax.jit(experiment.search)
+    collect, search = jax.jit(experiment.collect), jax.jit(experiment.search)
     judge = jax.jit(jax.vmap(lambda key, params: experiment.episode(key, params, False).cost, (0, None)))
     found = []
     for seed in seeds:
         state, row = experiment.init(jax.random.key(seed)), []
-        for number in range(searches):
-            rows = run(jax.random.key(10 * seed + number), state.policy.params, number == 0)
-            state = experiment.add_episode(state, rows)._replace(succeeded=jnp.bool_(False))
+        for _ in range(searches):
+            state = experiment.add_episode(state, collect(state))._replace(succeeded=jnp.bool_(False))
             state, _ = search(state)
-            state = state._replace(policy_trial=state.trial)
             costs = np.asarray(judge(jax.random.split(jax.random.key(7), EPISODES), state.policy.params))
             row.append((float(np.mean(costs)), float(np.mean(episode.succeeded(costs, experiment.task)))))
         found.append(row)
@@ -63,7 +62,7 @@ def searched(config: Config, seeds: list[int], searches: int) -> list[list[tuple
 
 
 def main(given: list[str]) -> None:
-    """The command line of this module."""
+    """The command line of this module. Raises ConfigError for what it cannot use."""
     options, words = config_io.split(given, ("delay", "seeds", "searches"))
     own = dict(word.split("=", 1) for word in CARTPOLE) | {"sensors.delay": options.get("delay", "1")}
     seeds, searches = seed_list(options.get("seeds", "100-105")), int(options.get("searches", "4"))
@@ -73,4 +72,7 @@ def main(given: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    try:
+        main(sys.argv[1:])
+    except ConfigError as error:
+        sys.exit(f"known_model: {error}")
