@@ -17,6 +17,7 @@ from pegasus_jax.vectorized import for_particles
 from probes import cart, experience, network, regression, same, tiny
 
 K, D = 2000, 3
+ALL = np.ones(D, bool)  # entries that differ between starts
 
 
 def rows(size, capacity=700):
@@ -30,16 +31,21 @@ def run_state(data, succeeded=True):
     return RunState(jax.random.key(0), data, nothing, nothing, jnp.int32(1), jnp.int32(1), jnp.bool_(succeeded))
 
 
+def remembered(data, succeeded=True, angles=(), varies=None):
+    varies = ALL if varies is None else varies
+    return remember(None, run_state(data, succeeded), angles=angles, varies=varies)
+
+
 def drawn(share, states, angles=(), around=0.0, succeeded=True):
     start = beside_visited(lambda key, given: jnp.full((K, D), -5.0), share, angles, jnp.full(D, around))
-    found = start(jax.random.key(0), Visited(None, states, jnp.ones(D), jnp.bool_(succeeded)))
+    found = start(jax.random.key(0), Visited(None, states, jnp.ones(D), jnp.bool_(succeeded), jnp.bool_(False)))
     assert np.array_equal(found.own, np.full((K, D), -5.0))
     return np.asarray(found.mixed)
 
 
 @pytest.mark.parametrize("size", [1, 7, STATES, 600])
 def test_the_states_are_the_rows_in_use_evenly(size):
-    kept = np.asarray(remember(None, run_state(rows(size)), angles=()).states)
+    kept = np.asarray(remembered(rows(size)).states)
     assert kept.shape == (STATES, D)
     places, counts = np.unique(kept[:, 0], return_counts=True)
     assert len(places) == min(size, STATES)
@@ -63,7 +69,7 @@ def test_so_large_a_share_starts_there(share):
 
 def test_before_a_success_nothing_starts_there():
     assert np.array_equal(drawn(1.0, jnp.zeros((STATES, D)), succeeded=False), np.full((K, D), -5.0))
-    assert not bool(remember(None, run_state(rows(3), succeeded=False), angles=()).succeeded)
+    assert not bool(remembered(rows(3), succeeded=False).succeeded)
 
 
 def walked(scale, turns=0.0):
@@ -71,7 +77,7 @@ def walked(scale, turns=0.0):
     x = np.random.default_rng(0).normal(size=(600, D)) * [1.0, 0.3, 0.0] + [0, 3.0, 5.0]
     x[:, 1] += turns * np.arange(600)
     data = rows(600, 600)._replace(x=jnp.asarray(x * [scale, 1.0, 1.0], jnp.float32))
-    return remember(None, run_state(data), angles=(1,))
+    return remembered(data, angles=(1,))
 
 
 def test_the_spread_is_that_of_the_states_whatever_turns_an_angle_has_made():
@@ -116,6 +122,35 @@ def test_a_search_on_a_plant_of_ones_own_drops_what_is_too_steep(monkeypatch):
     assert norm(10.0, 1000.0) == pytest.approx(1000 * usual, rel=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("still", "varies", "size", "goal"),
+    [((2,), (0, 2), 5, True), ((2,), (0, 1), 5, False), ((), (0, 1, 2), 5, False), ((0, 1, 2), (0,), 0, False)],
+)
+def test_what_never_changes_in_an_episode_and_differs_between_them_is_a_goal(still, varies, size, goal):
+    """Rows that are not in use are no evidence; nor are entries that are the same in all episodes."""
+    y = np.zeros((9, D), np.float32)
+    y[:size] = 0.5 * ~np.isin(np.arange(D), still)
+    data = rows(size, 9)._replace(y=jnp.asarray(y))
+    assert bool(remembered(data, varies=np.isin(np.arange(D), varies)).goal) == goal
+
+
+def test_particles_with_a_goal_are_not_matched():
+    """From its first step on their search minimizes what one does that keeps every particle and its cost apart."""
+
+    def first(goal, **search):
+        settings = dict(visited_starts=0.5, refine_fraction=0.5, cost_width_start=1.0) | search
+        experiment = compose(tiny(**{f"search__{name}": value for name, value in settings.items()}), cart())
+        state = experiment.init(jax.random.key(0))
+        state = experiment.add_episode(state, experiment.collect(state))
+        y = state.data.y.at[:, 0].set(0.0) if goal else state.data.y
+        state = state._replace(data=state.data._replace(y=y))
+        return float(experiment.search(experiment.fit(state)[0])[1].objective[0])
+
+    apart = dict(matching="never", cost_estimator="particles")
+    assert first(goal=True, matching="always") == pytest.approx(first(goal=True, **apart), rel=1e-5)
+    assert first(goal=False, matching="always") != pytest.approx(first(goal=False, **apart), rel=1e-3)
+
+
 def test_angles_are_those_near_the_starts_whatever_turns_the_plant_made():
     turns = jnp.full((STATES, D), 0.5 + 6 * np.pi, jnp.float32)
     x = drawn(1.0, turns, angles=(1,), around=np.pi)
@@ -132,7 +167,7 @@ def test_a_model_that_remembers_predicts_as_before(members):
     @partial(jax.jit, static_argnums=(0, 1))
     def predicted(one, remembered):
         posterior = one.posterior(model.init(jax.random.key(1)), data)
-        posterior = remember(posterior, run_state(data), angles=()) if remembered else posterior
+        posterior = remember(posterior, run_state(data), angles=(), varies=ALL) if remembered else posterior
         keys = jax.random.split(jax.random.key(2), 6)
         draws = jax.vmap(one.sample, (0, None))(keys, posterior) if one.deal is None else one.deal(keys, posterior)
         alone = one.apply(posterior, jax.tree.map(lambda leaf: leaf[0], draws), data.x[0], data.u[0])

@@ -39,7 +39,9 @@ PLANTS: dict[str, Plant] = {
         60.0,
     ),
     # The last two entries follow from the others.
-    "Reacher-v5": Plant("Reacher-v5", (*task(50, "reacher"), "sensors.measured=[0,1,2,3,4,5,6,7]"), 60, -6.0, 60.0),
+    "Reacher-v5": Plant(
+        "Reacher-v5", (*task(50, "reacher"), "success=0.01", "sensors.measured=[0,1,2,3,4,5,6,7]"), 60, -6.0, 60.0
+    ),
     "dm_cartpole": Plant(f"{DM}CartPole-v0", task(25, "dm_cartpole", angles="[1]", rates="[2,3]"), 12, 850.0, 25.0),
     "dm_pendulum": Plant(
         f"{DM}Pendulum-v0", task(80, "pendulum", angles="[0]", module="costs_of_joints", rates="[1]"), 8, 800.0, 40.0

@@ -123,6 +123,7 @@ def search_of(
         short = None if limit is None else limit * row.limit
         if search.visited_starts:
             given = started(given, row.refine)
+            refining = refining | posterior.goal  # a goal is not to be redrawn either
             short = scale_for(begun()) * longest(posterior, search.particles) if limit is None else short
         return objective_of(
             params,

@@ -28,13 +28,19 @@ class Visited(NamedTuple):
     states: Array  # [512, D + M]
     spread: Array  # [D + M] the standard deviations of the states
     succeeded: Array  # [] bool, whether the newest episode did
+    goal: Array  # [] bool, whether an entry of x stays as it is through each episode, and differs between them
 
 
-def remember(posterior: Any, state: RunState, *, angles: tuple[int, ...]) -> Visited:
-    """The posterior with rows evenly spaced in a run's data, repeated where it has few."""
+def remember(posterior: Any, state: RunState, *, angles: tuple[int, ...], varies: Array) -> Visited:
+    """The posterior with rows evenly spaced in a run's data, repeated where it has few.
+
+    `varies` [D] bool are the entries of x that differ between the starts of episodes.
+    """
     rows = jnp.arange(STATES) * state.data.size // STATES
     states = join(state.data.x, state.data.memory)[rows]
-    return Visited(posterior, states, jnp.std(difference(states, states[0], angles), 0), state.succeeded)
+    spread = jnp.std(difference(states, states[0], angles), 0)
+    stays = jnp.all(state.data.y == 0, 0) & (state.data.size > 0)  # rows that are not in use are 0
+    return Visited(posterior, states, spread, state.succeeded, jnp.any(stays & varies))
 
 
 def longest(given: Visited, particles: int) -> Array:
