@@ -82,7 +82,9 @@ def compose(
         search_steps=config.search.steps,
         imagine=searching.imagine,
         expect=searching.expect if visits else None,
-        remember=partial(visited.remember, angles=task.angles, varies=np.asarray(task.start_std) > 0) if visits else None,
+        remember=partial(visited.remember, angles=task.angles, varies=np.asarray(task.start_std) > 0)
+        if visits
+        else None,
         explore=explore_of(config.explore, task),
         explore_trials=config.explore.trials,
         first_search=settings.first_search(config) if task.prior is None else config.explore.trials,
