@@ -3,9 +3,12 @@
     python -m benchmarks.robot.sensors cartpole [delay=0] [seeds=100-109] [trials=10] [out=FILE] [setting=value ...]
     python -m benchmarks.robot.sensors furuta furuta=FOLDER [delay=1] [seeds=100-109] [trials=13] [jobs=2] [minutes=9]
         [out=FILE] [setting=value ...]
+    python -m benchmarks.robot.sensors defaults furuta=FOLDER [the same, without delay=]
 
 The cart-pole's state has neither rate measured, and its force acts `delay` periods late. FOLDER holds `robot.py`, which
-registers FurutaSafe-v0 and has its `cost`; two encoders of it are all that is observed (encoders.py), for 2 s.
+registers FurutaSafe-v0 and has its `cost`; two encoders of it are all that is observed (encoders.py), for 2 s. With
+`defaults` it observes what FurutaSafe-v0 does, differences of the encoders and the voltage before, and nothing of a
+model or a search is said.
 Every trial is written when it is there. Furuta runs that were stopped after `minutes` go on with the same command.
 Tuning seeds are 100 to 119.
 """
@@ -22,10 +25,14 @@ from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import share_cpus
 from pegasus_jax.runs.study import seed_list, study, table, write
 
+PENDULUM = ("task=gym", "cost=robot:cost", "angles=[1]", "horizon=100", "explore.kind=walk", "eval_episodes=10")
 FURUTA = (
-    *("task=gym", "env=benchmarks.robot.encoders:TwoEncoders-v0", "cost=robot:cost", "angles=[1]", "horizon=100"),
-    *("model=lagrangian", "start_mean=[0,0]", "start_std=[0.02,0.02]", "explore.kind=walk", "eval_episodes=10"),
-    "sensors.velocity=difference",
+    *(*PENDULUM, "env=benchmarks.robot.encoders:TwoEncoders-v0", "start_mean=[0,0]", "start_std=[0.02,0.02]"),
+    *("model=lagrangian", "sensors.velocity=difference"),
+)
+DEFAULTS = (
+    *(*PENDULUM, "env=robot:FurutaSafe-v0", "start_mean=[0,0,0,0,0]"),
+    "start_std=[0.02,0.02,0.01,0.01,0.01]",
 )
 CARTPOLE = (
     *("task=cartpole", "sensors.measured=[0,3]", "sensors.velocity=difference", "explore.kind=walk"),
@@ -52,7 +59,16 @@ def furuta(options: dict[str, str], words: Sequence[str], command: str) -> None:
     print(seeds.table(seeds.learned(options, given, command)))
 
 
-KINDS = {"cartpole": cartpole, "furuta": furuta}
+def defaults(options: dict[str, str], words: Sequence[str], command: str) -> None:
+    """As `furuta`, of what the environment observes itself. Raises ConfigError for a delay that is not its own."""
+    if "delay" in options:
+        raise ConfigError(f"delay={options['delay']} is for furuta; this environment is one period late")
+    seeds.robot(options)
+    options.setdefault("trials", "13")
+    print(seeds.table(seeds.learned(options, [*DEFAULTS, *words], command)))
+
+
+KINDS = {"cartpole": cartpole, "furuta": furuta, "defaults": defaults}
 
 
 def main(given: list[str]) -> None:
@@ -61,8 +77,9 @@ def main(given: list[str]) -> None:
     choice("the first word", kind, KINDS)
     options, dotted = config_io.split(rest, ("delay", *seeds.OPTIONS))
     options.setdefault("out", f"runs/sensors-{kind}.json")
-    delay = options.get("delay", {"cartpole": "0", "furuta": "1"}[kind])
-    words = [f"sensors.delay={delay}", *(f"{key}={value}" for key, value in dotted.items())]
+    words = [f"{key}={value}" for key, value in dotted.items()]
+    if kind != "defaults":
+        words = [f"sensors.delay={options.get('delay', {'cartpole': '0', 'furuta': '1'}[kind])}", *words]
     if kind == "cartpole":
         words.append(f"trials={options.get('trials', '10')}")
     Path(options["out"]).parent.mkdir(parents=True, exist_ok=True)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from pegasus_jax.imagine.scenarios import Block
 from pegasus_jax.math.angles import difference
@@ -31,7 +32,7 @@ class Visited(NamedTuple):
     goal: Array  # [] bool, whether an entry of x stays as it is through each episode, and differs between them
 
 
-def remember(posterior: Any, state: RunState, *, angles: tuple[int, ...], varies: Array) -> Visited:
+def remember(posterior: Any, state: RunState, *, angles: tuple[int, ...], varies: np.ndarray) -> Visited:
     """The posterior with rows evenly spaced in a run's data, repeated where it has few.
 
     `varies` [D] bool are the entries of x that differ between the starts of episodes.
