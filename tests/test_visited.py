@@ -31,8 +31,7 @@ def run_state(data, succeeded=True):
     return RunState(jax.random.key(0), data, nothing, nothing, jnp.int32(1), jnp.int32(1), jnp.bool_(succeeded))
 
 
-def remembered(data, succeeded=True, angles=(), varies=None):
-    varies = ALL if varies is None else varies
+def remembered(data, succeeded=True, angles=(), varies=ALL):
     return remember(None, run_state(data, succeeded), angles=angles, varies=varies)
 
 

@@ -30,10 +30,8 @@ FURUTA = (
     *(*PENDULUM, "env=benchmarks.robot.encoders:TwoEncoders-v0", "start_mean=[0,0]", "start_std=[0.02,0.02]"),
     *("model=lagrangian", "sensors.velocity=difference"),
 )
-DEFAULTS = (
-    *(*PENDULUM, "env=robot:FurutaSafe-v0", "start_mean=[0,0,0,0,0]"),
-    "start_std=[0.02,0.02,0.01,0.01,0.01]",
-)
+SAFE = ("env=robot:FurutaSafe-v0", "start_mean=[0,0,0,0,0]", "start_std=[0.02,0.02,0.01,0.01,0.01]")
+DEFAULTS = (*PENDULUM, *SAFE)
 CARTPOLE = (
     *("task=cartpole", "sensors.measured=[0,3]", "sensors.velocity=difference", "explore.kind=walk"),
     "search.observation_noise=plant",  # what the model predicts is twice the sensors' noise
@@ -53,19 +51,21 @@ def cartpole(options: dict[str, str], words: Sequence[str], command: str) -> Non
 
 def furuta(options: dict[str, str], words: Sequence[str], command: str) -> None:
     """A process a seed, `jobs` at a time with a core each. Raises ConfigError where there is no robot."""
-    seeds.robot(options)
-    options.setdefault("trials", "13")
-    given = [*FURUTA, *words, f"env_args.delay={options.get('delay', '1')}"]
-    print(seeds.table(seeds.learned(options, given, command)))
+    seed_by_seed(options, [*FURUTA, *words, f"env_args.delay={options.get('delay', '1')}"], command)
 
 
 def defaults(options: dict[str, str], words: Sequence[str], command: str) -> None:
     """As `furuta`, of what the environment observes itself. Raises ConfigError for a delay that is not its own."""
     if "delay" in options:
         raise ConfigError(f"delay={options['delay']} is for furuta; this environment is one period late")
+    seed_by_seed(options, [*DEFAULTS, *words], command)
+
+
+def seed_by_seed(options: dict[str, str], words: Sequence[str], command: str) -> None:
+    """The runs of these words on the robot of the folder `furuta`, and their table."""
     seeds.robot(options)
     options.setdefault("trials", "13")
-    print(seeds.table(seeds.learned(options, [*DEFAULTS, *words], command)))
+    print(seeds.table(seeds.learned(options, words, command)))
 
 
 KINDS = {"cartpole": cartpole, "furuta": furuta, "defaults": defaults}
