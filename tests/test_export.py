@@ -44,6 +44,7 @@ POLICIES: dict[str, dict[str, str]] = {
     "mlp": {},
     "mlp, everything": {"policy__dropout": "0.2", "policy__squash": "sine", "policy__input_units": "[2,3,4]"},
     "mlp of circles": {},
+    "mlp, found units": {"policy__input_units": "null"},
     "linear of circles": {"policy": "linear", "policy__squash": "tanh"},
     "rbf of circles": {"policy": "rbf", "policy__num_centers": "7"},
     "mlp, double": {"x64": "true"},

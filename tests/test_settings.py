@@ -266,7 +266,7 @@ WRONG = [
     (["seed=${trials}"], ["seed=", "is not a value but a reference"]),
     (["task=gym", "angles=[[1]]"], ["angles=[[1]] is not a list of whole numbers"]),
     (["task=mjcf", "observe=[[qpos.0]]"], ["observe=[[qpos.0]] is not a list of words"]),
-    (["policy.input_units=[[1]]"], ["policy.input_units=[[1]] is not a list of numbers"]),
+    (["policy.input_units=[[1]]"], ["policy.input_units=[[1]] is not a list of numbers or null"]),
     # words that the task does not use
     (["horizon=40"], ["horizon=40 is of no use with task=cartpole", "task=gym"]),
     (["task=cartpole", "legs=2"], ["legs=2 is of no use with task=cartpole", "task=swimmer_"]),

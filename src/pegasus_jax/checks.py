@@ -199,6 +199,7 @@ def called(kind: Any) -> str:
         str: "a word",
         tuple[int, ...]: "a list of whole numbers",
         tuple[float, ...]: "a list of numbers",
+        tuple[float, ...] | None: "a list of numbers or null",
         tuple[str, ...]: "a list of words",
         tuple[tuple[int, ...], ...] | None: "a list of pairs of whole numbers or null",
         tuple[tuple[float, ...], ...]: "a list of lists of numbers",

@@ -16,8 +16,8 @@ class MLP:
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: float = setting(0.0, "drop probability of the hidden units; 0 is a deterministic policy")
     squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
-    input_units: tuple[float, ...] = setting(
-        (), "unit of each state that is not an angle, one number each; []: the plant's units"
+    input_units: tuple[float, ...] | None = setting(
+        (), "unit of each state that is not an angle, one number each; []: the plant's units; null: found in the data"
     )
     initializer: str = setting("glorot", "initial weights: glorot, orthogonal")
 
@@ -28,7 +28,7 @@ class MLP:
         for name, choices in (("squash", SQUASHES), ("initializer", INITIALIZERS)):
             checks.choice(f"policy.{name}", getattr(self, name), choices)
         checks.check_range("policy.dropout", self.dropout, 0, 0.99)
-        for unit in self.input_units:
+        for unit in self.input_units or ():
             checks.check_range("policy.input_units", unit, 0, open_low=True)
 
 

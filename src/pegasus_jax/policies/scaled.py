@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from pegasus_jax.types import Array, Params
 
 LARGE = 20.0  # root mean square; entries of our own plants reach 9, and are left as they are
+MOST = 3.0  # root mean square of an entry whose unit is found in the data: docs/decisions.md 0040
 CONSTANT = 1e-5  # of its size: what an entry varies by rounding
 
 
@@ -23,11 +24,13 @@ def in_units(units: Array) -> Input:
     return Input(jnp.zeros_like(units), units)
 
 
-def of_data(features: Array, size: Array, units: Array | float = 1.0) -> Input:
+def of_data(features: Array, size: Array, units: Array | float = 1.0, found: bool = False) -> Input:
     """The input for data whose first `size` rows of features [N, F] are in use, each counted in its unit [F].
 
     A feature whose root mean square is more than LARGE has its mean subtracted and is divided by its standard
-    deviation, or by its unit where it is constant; the others are divided by their unit only.
+    deviation, or by its unit where it is constant; the others are divided by their unit only. With units to be
+    `found` in the data, those whose root mean square is above 1 then have MOST, and smaller ones are MOST times as
+    large as they were.
     """
     features = features / units
     used = (jnp.arange(features.shape[0]) < size)[:, None]
@@ -38,7 +41,8 @@ def of_data(features: Array, size: Array, units: Array | float = 1.0) -> Input:
     spread = jnp.sqrt(jnp.sum(jnp.where(used, rows - mean, 0) ** 2, 0) / count)
     large = size_of > LARGE
     scale = jnp.where(spread > CONSTANT * size_of, spread, 1)
-    return Input(jnp.where(large, mean, 0) * units, jnp.where(large, scale, 1) * units)
+    unit = jnp.where(large, scale, jnp.maximum(size_of, 1)) / MOST if found else jnp.where(large, scale, 1)
+    return Input(jnp.where(large, mean, 0) * units, unit * units)
 
 
 def scaled(given: Input, features: Array) -> Array:

@@ -97,7 +97,7 @@ def known_sensors(task: Task) -> np.ndarray:
     return np.asarray(task.sensor_std, float)
 
 
-def input_scale(task: Task, units: tuple[float, ...]) -> Any:
+def input_scale(task: Task, units: tuple[float, ...] | None) -> Any:
     """What a policy's features [F] are multiplied by, so that it counts in these units; 1 for none.
 
     Raises ConfigError where they are not one for each state that is no angle.
