@@ -30,8 +30,7 @@ FURUTA = (
     *(*PENDULUM, "env=benchmarks.robot.encoders:TwoEncoders-v0", "start_mean=[0,0]", "start_std=[0.02,0.02]"),
     *("model=lagrangian", "sensors.velocity=difference"),
 )
-SAFE = ("env=robot:FurutaSafe-v0", "start_mean=[0,0,0,0,0]", "start_std=[0.02,0.02,0.01,0.01,0.01]")
-DEFAULTS = (*PENDULUM, *SAFE)
+DEFAULTS = (*PENDULUM, "env=robot:FurutaSafe-v0", "start_mean=[0,0,0,0,0]", "start_std=[0.02,0.02,0.01,0.01,0.01]")
 CARTPOLE = (
     *("task=cartpole", "sensors.measured=[0,3]", "sensors.velocity=difference", "explore.kind=walk"),
     "search.observation_noise=plant",  # what the model predicts is twice the sensors' noise

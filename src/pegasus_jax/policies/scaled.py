@@ -40,9 +40,9 @@ def of_data(features: Array, size: Array, units: Array | float = 1.0, found: boo
     size_of = jnp.sqrt(jnp.sum(rows**2, 0) / count)
     spread = jnp.sqrt(jnp.sum(jnp.where(used, rows - mean, 0) ** 2, 0) / count)
     large = size_of > LARGE
-    scale = jnp.where(spread > CONSTANT * size_of, spread, 1)
-    unit = jnp.where(large, scale, jnp.maximum(size_of, 1)) / MOST if found else jnp.where(large, scale, 1)
-    return Input(jnp.where(large, mean, 0) * units, unit * units)
+    others, most = (jnp.maximum(size_of, 1), MOST) if found else (1, 1)
+    scale = jnp.where(large, jnp.where(spread > CONSTANT * size_of, spread, 1), others) / most
+    return Input(jnp.where(large, mean, 0) * units, scale * units)
 
 
 def scaled(given: Input, features: Array) -> Array:
