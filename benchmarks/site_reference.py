@@ -19,7 +19,7 @@ GROUPS = {
     "A run": ("config", "start", "logs.read", "runs.controller", "exports.write", "math.delays", "checks"),
     "An experiment": ("assembly.experiments", "assembly.pieces", "experiment", "episode", "task", "vectorized"),
     "Imagination": ("imagine.scenarios", "imagine.rollout", "imagine.objective"),
-    "Fit and search": ("learn.fit", "learn.gradient", "learn.search", "learn.rounds", "learn.schedule"),
+    "Fit and search": ("learn.fit", "learn.gradient", "learn.search", "learn.rounds", "learn.schedule", "learn.visits"),
     "Models": ("models.bnn", "models.ensemble", "models.lagrangian", "pilco.gp", "pilco.ssgp"),
     "Policies": ("policies.mlp", "policies.linear", "policies.wrap", "pilco.rbf"),
     "Types": ("types",),

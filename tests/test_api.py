@@ -283,7 +283,7 @@ def _() -> Any:
     found = pg.searcher(problem)
     learner = pg.TrainState(params, found.init(params))
     assert isinstance(learner.optimizer, pg.SearchState)
-    fresh = POLICY.init(jax.random.key(1))
+    fresh = jax.vmap(POLICY.init)(jax.random.split(jax.random.key(1)))
     by_hand = pg.search(key(), learner, posterior, problem=problem, steps=2, fresh=fresh)
     return by_hand[0].params, found.run(key(), learner, posterior, steps=2, fresh=fresh)[1]
 

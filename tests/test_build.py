@@ -312,7 +312,7 @@ def test_the_settings_of_pilcos_search_reach_its_objective():
         chosen = dataclasses.replace(ANALYTIC, **{"policy_noise": 0.0, "state_noise": 0.0, **search})
         searcher = search_of(chosen, task, dynamics, policy).searcher
         params = jnp.full((1, 2), -0.5)
-        run = jax.jit(partial(searcher.run, first=0, steps=1, fresh=params))
+        run = jax.jit(partial(searcher.run, first=0, steps=1, fresh=jnp.stack([params] * 2)))
         return float(run(jax.random.key(0), TrainState(params, searcher.init(params)), None)[1].objective[0])
 
     of_cart = partial(value, cart(horizon=3))

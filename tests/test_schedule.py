@@ -15,11 +15,13 @@ from pegasus_jax.learn.schedule import (
     CURRENT,
     EVALUATE,
     FRESH,
+    LEADER,
+    OTHER,
     START,
     STEP,
-    first_rows,
     search_table,
 )
+from pegasus_jax.learn.visits import first_rows
 from pegasus_jax.viz.search_table import text
 
 
@@ -41,7 +43,10 @@ def test_the_plain_table_is_the_printed_algorithm():
 def test_a_search_starts_from_the_policy_it_is_told():
     assert visits(init="better") == [(0, 0, EVALUATE, CURRENT), (0, 0, EVALUATE, FRESH), *STEPS]
     assert visits(init="fresh") == [(0, 0, STEP, FRESH), *STEPS[1:]]
-    with pytest.raises(ValueError, match=r"init=old is not a choice; .*choices: previous, better, fresh"):
+    race = [(0, 0, STEP, FRESH), (1, 1, STEP, OTHER), (1, 2, EVALUATE, CURRENT), (1, 2, EVALUATE, LEADER)]
+    end = [(3, 4, EVALUATE, CURRENT), (3, 4, EVALUATE, START)]
+    assert visits(init="raced", refine=4) == [*race, *STEPS[2:], *end]
+    with pytest.raises(ValueError, match=r"init=old is not a choice; .*choices: previous, better, fresh, raced"):
         search_table(4, init="old")
 
 
@@ -55,7 +60,7 @@ def test_a_refinement_begins_and_ends_with_a_comparison_under_its_own_objective(
     assert visits(refine=0) == [*STEPS, *end]
 
 
-@pytest.mark.parametrize("init", ["previous", "better", "fresh"])
+@pytest.mark.parametrize("init", ["previous", "better", "fresh", "raced"])
 @pytest.mark.parametrize("refine", [None, 0, 2, 4])
 def test_iterations_begin_where_those_before_have_ended(init, refine):
     table = search_table(4, init=init, refine=refine)
@@ -72,6 +77,10 @@ def of_steps(column, table):
 def test_the_width_narrows_geometrically_and_stays():
     table = search_table(25, cost_width_start=4.0, anneal_trials=1)
     np.testing.assert_allclose(table.cost_width[0, [0, 5, 10, 13, 20]], [4, 4**0.6, 4**0.2, 1, 1])
+    raced = search_table(40, cost_width_start=4.0, refine=20, init="raced")  # a race counts once
+    np.testing.assert_allclose(
+        of_steps(raced.cost_width, raced)[0, [0, 4, 5, 9, 10]], 4 ** np.array([1, 7 / 15, 1, 7 / 15, 1 / 3])
+    )
     refining = search_table(40, cost_width_start=4.0, refine=20)  # by half of the coarse part
     np.testing.assert_allclose(of_steps(refining.cost_width, refining)[0, [0, 5, 10, 15]], [4, 2, 1, 1])
 

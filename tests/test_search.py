@@ -218,9 +218,9 @@ def begin(optimizer):
     return TrainState(jnp.ones(3), optimizer.init(jnp.ones(3)))
 
 
-def loop(optimizer, iterations):
+def loop(optimizer, iterations, params=(1.0, 1.0, 1.0)):
     """The same search as a Python loop over the given iterations."""
-    learner, key = begin(optimizer), jax.random.key(7)
+    learner, key = TrainState(jnp.array(params), optimizer.init(jnp.array(params))), jax.random.key(7)
     for i in iterations:
         gradient = jax.grad(distance)(learner.params, 1.0, follow(jax.random.clone(key), i, None))
         updates, state = optimizer.update(gradient, learner.optimizer, learner.params)
@@ -279,7 +279,7 @@ def test_a_fresh_policy_is_taken_where_it_costs_no_more_or_the_last_search_found
     found, learner = on_table(search_table(1, init="better"), optax.sgd(0.0), STILL, rowless)
     state = learner.optimizer._replace(no_improvement=jnp.asarray(stuck))
     learner = TrainState(jnp.full(3, float(own)), state)
-    after, info = found.run(jax.random.key(0), learner, 1.0, steps=1, fresh=jnp.full(3, float(other)))
+    after, info = found.run(jax.random.key(0), learner, 1.0, steps=1, fresh=jnp.full((2, 3), float(other)))
     assert np.array_equal(after.params, np.full(3, other if taken else own))
     np.testing.assert_allclose(info.objective, 3 * float(other if taken else own) ** 2)
 
@@ -289,15 +289,15 @@ def test_a_fresh_policy_that_a_table_needs_and_iterations_that_it_lacks_are_erro
     with pytest.raises(ValueError, match="fresh= is None; expected its parameters"):
         found.run(jax.random.key(0), learner, 1.0, steps=1)
     with pytest.raises(ValueError, match="steps=3: the table of this search has 2"):
-        found.run(jax.random.key(0), learner, 1.0, steps=3, fresh=jnp.zeros(3))
+        found.run(jax.random.key(0), learner, 1.0, steps=3, fresh=jnp.zeros((2, 3)))
 
 
-@pytest.mark.parametrize(("init", "asks"), [("previous", False), ("better", True), ("fresh", True)])
+@pytest.mark.parametrize(("init", "asks"), [("previous", False), ("better", True), ("fresh", True), ("raced", True)])
 def test_a_fresh_policy_that_no_row_asks_for_is_not_used(init, asks):
     """So that a program need not draw it."""
-    found, learner = on_table(search_table(2, init=init), optax.sgd(0.1), STILL, rowless)
-    run = partial(found.run, jax.random.key(0), learner, 1.0, steps=2)
-    program = jax.make_jaxpr(lambda fresh: run(fresh=fresh))(jnp.zeros(3)).jaxpr
+    found, learner = on_table(search_table(4, init=init, refine=4), optax.sgd(0.1), STILL, rowless)
+    run = partial(found.run, jax.random.key(0), learner, 1.0, steps=4)
+    program = jax.make_jaxpr(lambda fresh: run(fresh=fresh))(jnp.zeros((2, 3))).jaxpr
     assert any(program.invars[0] is used for step in program.eqns for used in step.invars) == asks
 
 
@@ -340,10 +340,11 @@ def test_a_search_that_only_refines_is_the_last_part_of_a_whole_one(calls):
     assert run._cache_size() == 1
 
 
-def test_what_works_is_refined_but_in_the_first_second_fourth_eighth_search():
+@pytest.mark.parametrize("init", ["better", "raced"])
+def test_what_works_is_refined_but_in_the_first_second_fourth_eighth_search(init):
     """One that does not work, as with `False`, begins the count again."""
-    found, learner = on_table(search_table(6, init="better", refine=4), optax.adam(0.1), value=rowless)
-    run, done = jax.jit(partial(found.run, steps=6, fresh=jnp.zeros(3))), []
+    found, learner = on_table(search_table(6, init=init, refine=4), optax.adam(0.1), value=rowless)
+    run, done = jax.jit(partial(found.run, steps=6, fresh=jnp.zeros((2, 3)))), []
     for works in [True] * 9 + [False] + [True] * 3:
         learner, info = run(jax.random.key(7), learner, 1.0, first=0, works=works)
         done.append(int(info.iterations))
@@ -355,13 +356,55 @@ def test_what_works_is_refined_but_in_the_first_second_fourth_eighth_search():
 def test_a_whole_search_that_is_given_what_works_begins_with_a_fresh_policy_and_ends_with_the_better(works, starts):
     """Here the fresh one costs more, and steps do not move it."""
     found, learner = on_table(search_table(2, init="better", refine=1), optax.sgd(0.0), STILL, rowless)
-    fresh = jnp.full(3, 3.0)
+    fresh = jnp.full((2, 3), 3.0)
     after, info = found.run(jax.random.key(0), learner, 1.0, steps=2, fresh=fresh, works=works)
     np.testing.assert_allclose(info.objective, [3.0, 3.0])  # of the policy at the end of each iteration
     assert np.array_equal(after.params, np.ones(3))
     moving, learner = on_table(search_table(3, init="better", refine=2), optax.sgd(0.0), STILL, rowless)
     _, info = moving.run(jax.random.key(0), learner, 1.0, steps=1, fresh=fresh, works=works)
     np.testing.assert_allclose(info.objective, [3 * starts])
+
+
+@pytest.mark.parametrize("calls", [1, 4])
+@pytest.mark.parametrize(
+    ("given", "works", "stuck", "objectives", "end"),
+    [
+        (0.5, False, False, [3, 3, 0.75, 0.75, 0.75, 0.75, 0.75, 0.75], 0.5),  # the given one runs second, and wins
+        (2, False, False, [3, 3, 12, 3, 3, 3, 3, 3], 1),  # or loses
+        (2, False, True, [3, 3, 27, 3, 3, 3, 3, 3], 1),  # what the last search could not better runs no more
+        (0.5, True, False, [3, 3, 27, 3, 3, 3, 3, 0.75], 0.5),  # one that works is challenged, and kept if better
+        (2, True, False, [3, 3, 27, 3, 3, 3, 3, 3], 1),
+    ],
+)
+def test_the_winner_of_a_race_goes_on_and_the_better_of_it_and_the_given_policy_stays(
+    given, works, stuck, objectives, end, calls
+):
+    """Fresh ones at 1 and at 3, where a step moves nothing; the objective is that of the end of each iteration."""
+    found, learner = on_table(search_table(8, init="raced", refine=8), optax.sgd(0.0), STILL, rowless)
+    learner = TrainState(jnp.full(3, float(given)), learner.optimizer._replace(no_improvement=jnp.asarray(stuck)))
+    fresh, values = jnp.array([[1.0], [3.0]]) * jnp.ones(3), []
+    run = jax.jit(partial(found.run, steps=8 // calls))
+    for call in range(calls):
+        first = call * (8 // calls)
+        learner, info = run(jax.random.key(0), learner, 1.0, first=first, fresh=fresh, works=jnp.asarray(works))
+        values += info.objective.tolist()
+    np.testing.assert_allclose(values, objectives)
+    np.testing.assert_allclose(learner.params, end)
+
+
+@pytest.mark.parametrize("wins", ["first", "second"])
+def test_a_race_is_of_two_searches_that_begin_alike_and_its_winner_goes_on_as_if_alone(wins):
+    """With Adam, whose moments come back with the one that ran first; the scenarios are those of each iteration."""
+    optimizer, table = optax.adam(0.1), search_table(8, init="raced", refine=8)
+    draws = {"first": range(2), "second": range(2, 4)}[wins]
+    near, far = jnp.full(3, 0.1), jnp.full(3, 9.0)
+    order = [near, far] if wins == "first" else [far, near]
+    found, _ = on_table(table, optimizer, value=rowless)
+    learner = TrainState(order[1], found.init(order[1]))
+    fresh = jnp.stack([order[0], order[0]])
+    after, _ = found.run(jax.random.key(7), learner, 1.0, steps=8, fresh=fresh)
+    expected = loop(optimizer, [*draws, *range(4, 8)], near)
+    np.testing.assert_allclose(after.params, expected.params, rtol=1e-5)
 
 
 @pytest.mark.parametrize("calls", [1, 4])

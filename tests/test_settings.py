@@ -100,7 +100,7 @@ def test_a_tasks_own_model_gives_way_to_a_named_model_and_to_the_papers_algorith
     network = config_io.parse({"task": "cartpole", "model": "log_normal"})
     assert network.model == BNN()
     assert network.search == CARTPOLE.search
-    assert own.search == dataclasses.replace(CARTPOLE.search, particles=50, learning_rate=3e-3)
+    assert own.search == dataclasses.replace(CARTPOLE.search, particles=50, learning_rate=3e-3, init="raced")
     assert (own.policy, network.policy) == (MLP(hidden=(64, 64)), MLP())
     for words in ({"algorithm": "paper"}, {"algorithm": "deep_pilco"}):
         assert config_io.parse(words) == config_io.parse({"model": "log_normal", **words})

@@ -45,9 +45,9 @@ if TYPE_CHECKING:
     from pegasus_jax.learn.schedule import SearchTable as SearchTable
     from pegasus_jax.learn.schedule import search_table as search_table
     from pegasus_jax.learn.search import Problem as Problem
-    from pegasus_jax.learn.search import SearchState as SearchState
     from pegasus_jax.learn.search import search as search
     from pegasus_jax.learn.search import searcher as searcher
+    from pegasus_jax.learn.visits import SearchState as SearchState
     from pegasus_jax.logs.read import load_logs as load_logs
     from pegasus_jax.math import angles as angles
     from pegasus_jax.math import gaussian as gaussian
@@ -108,7 +108,8 @@ _NAMES = {
     "learn.fit": "fit FitInfo minibatches",
     "imagine.objective": "objective",
     "learn.gradient": "gradient_search SearchInfo",
-    "learn.search": "search searcher Problem SearchState",
+    "learn.search": "search searcher Problem",
+    "learn.visits": "SearchState",
     "learn.rounds": "Progress",
     "learn.schedule": "search_table SearchTable",
     # models and policies

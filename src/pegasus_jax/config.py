@@ -27,7 +27,7 @@ MATCHINGS = ("always", "narrow", "never")
 COST_ESTIMATORS = ("gaussian", "particles")
 OBSERVATION_NOISES = ("model", "plant")
 INIT_PARTS = ("policy", "model")
-INITS = ("previous", "better", "fresh")
+INITS = ("previous", "better", "fresh", "raced")
 LEGS = (2, 6)
 SUCCESSORS = ("always", "better")
 DATA_CONTROLS = ("sent", "before")
@@ -123,7 +123,8 @@ class Search:
     reset_optimizer: bool = setting(True, "forget Adam's moments at each trial")
     init: str = setting(
         "better",
-        "what a search starts from: the previous policy, a fresh one, or the better of both",
+        "what a search starts from: the previous policy; a fresh one; the better of both; or raced, the better of both"
+        " after a quarter of the search before it refines for each",
     )
     num_starts: int = setting(
         1, "policies searched side by side, the best of which goes on: the old one and fresh ones"
@@ -168,8 +169,8 @@ class Search:
             )
         if self.anneal_trials > 1 and self.refine_fraction:
             raise ConfigError(f"search.anneal_trials={self.anneal_trials} needs search.refine_fraction=0")
-        if self.init == "fresh" and not self.refine_fraction:
-            raise ConfigError("search.init=fresh needs search.refine_fraction=0.5; the nearest is better")
+        if self.init in INITS[2:] and not self.refine_fraction:
+            raise ConfigError(f"search.init={self.init} needs search.refine_fraction=0.5; the nearest is better")
         if self.visited_starts and not self.refine_fraction:
             raise ConfigError(
                 f"search.visited_starts={self.visited_starts:g} needs search.refine_fraction=0.5; the nearest is 0"

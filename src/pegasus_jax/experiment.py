@@ -207,7 +207,8 @@ def experiment(
 
         # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
         # that knows nothing is the better start.
-        fresh = adapted(policy.init(trial_key(state.key, state.trial, RESTART)), state.data)
+        keys = jax.random.split(trial_key(state.key, state.trial, RESTART))
+        fresh = jax.tree.map(lambda *two: jnp.stack(two), *(adapted(policy.init(key), state.data) for key in keys))
         untrained = (state.trial <= first_search) & (first == 0)
         worked = state.succeeded & (state.policy_trial > 0)  # a policy, and not random controls
         given = state.policy.params  # one that has learned keeps the inputs that it has learned with

@@ -38,8 +38,14 @@ CARTPOLE = Config(
     model=Lagrangian(substeps=1),  # one: docs/decisions.md 0036
     fit=Fit(steps=3000, learning_rate=3e-3),
     policy=SMALL_POLICY,
-    # docs/decisions.md 0014, 0015 and 0029.
-    search=Search(particles=50, learning_rate=SMALL_POLICY_STEP, standardized_noise=True, refine_fraction=0.5),
+    # docs/decisions.md 0014, 0015, 0029 and 0041.
+    search=Search(
+        particles=50,
+        learning_rate=SMALL_POLICY_STEP,
+        standardized_noise=True,
+        refine_fraction=0.5,
+        init="raced",
+    ),
 )
 
 # docs/decisions.md 0006, 0008, 0009 and 0011.
@@ -124,7 +130,9 @@ NETWORKS: dict[str, Config] = {
         model=BNN(),
         fit=Fit(),
         policy=MLP(),
-        search=replace(CARTPOLE.search, particles=Search.particles, learning_rate=Search.learning_rate),
+        search=replace(
+            CARTPOLE.search, particles=Search.particles, learning_rate=Search.learning_rate, init=Search.init
+        ),
     ),
     "double_cartpole_network": DOUBLE_CARTPOLE_NETWORK,
     **{

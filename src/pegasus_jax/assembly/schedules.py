@@ -26,7 +26,7 @@ def table_of(search: settings.Search, width: float) -> SearchTable:
     most = ROUNDS if search.num_starts == 1 else 1  # of policies side by side none ends before the others
     table = search_table(
         search.steps,
-        init="previous" if search.num_starts > 1 else search.init,  # of several, others are fresh
+        init=init_of(search),
         refine=rounds_from(first, search.steps, most) if search.refine_fraction else None,
         cost_width_start=width,
         decay=search.decay,
@@ -35,6 +35,11 @@ def table_of(search: settings.Search, width: float) -> SearchTable:
         warm_limit_factor=search.warm_limit_factor,
     )
     return holding(table) if search.cost_width_start is None else table
+
+
+def init_of(search: settings.Search) -> str:
+    """What a search starts from: of policies side by side, others are fresh."""
+    return "previous" if search.num_starts > 1 else search.init
 
 
 def rounds_from(refine: int, steps: int, most: int) -> list[int]:

@@ -9,7 +9,7 @@ import optax
 
 from pegasus_jax import config as settings
 from pegasus_jax import tasks
-from pegasus_jax.assembly.schedules import at_starts, scale_for, table_of, width_of
+from pegasus_jax.assembly.schedules import at_starts, init_of, scale_for, table_of, width_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import limits as limited
@@ -140,7 +140,7 @@ def search_of(
     optimizer = optax.chain(clip, optax.adam(search.learning_rate))
     draws = scenarios.sampler(searched, Period(**vars(search.period)))
     more: dict[str, Any] = dict(reset_optimizer=search.reset_optimizer, ascend=ascend)
-    found = tabled(table, lambda rows: searcher(Problem(value, draws, optimizer, rows, **more)))
+    found = tabled(init_of(search), table, lambda rows: searcher(Problem(value, draws, optimizer, rows, **more)))
     if search.num_starts > 1:
         lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
         # What refines may end with another than its last.
@@ -161,13 +161,15 @@ def matching_of(search: settings.Search, task: Task) -> Matching:
     return MATCHINGS[search.matching] if task.memory.matched and task.constraint is None else UNMATCHED
 
 
-def tabled(table: Callable[[], SearchTable], searches: Callable[[SearchTable], PolicyOptimizer]) -> PolicyOptimizer:
+def tabled(
+    init: str, table: Callable[[], SearchTable], searches: Callable[[SearchTable], PolicyOptimizer]
+) -> PolicyOptimizer:
     """The searcher of a table that is made when a search needs it: a controller alone has no cost to look at."""
 
     def run(*given: Any, **where: Any) -> tuple[TrainState, Any]:
         return searches(table()).run(*given, **where)
 
-    return PolicyOptimizer(searches(search_table(1)).init, run)
+    return PolicyOptimizer(searches(search_table(8, init=init, refine=8)).init, run)
 
 
 def refines_successes(search: settings.Search | settings.Analytic) -> bool:

@@ -10,7 +10,8 @@ from pegasus_jax.config import INITS
 from pegasus_jax.math.decay import half_cosine
 
 EVALUATE, STEP = range(2)  # what a row does with the candidate whose cost and gradient it computes
-CURRENT, FRESH, START, COARSE = range(4)  # which parameters it visits: see `SearchTable.candidate`
+CURRENT, FRESH, OTHER, LEADER, START, COARSE = range(6)  # which parameters it visits: see `SearchTable.candidate`
+RACED = 0.25  # of what comes before the refinement, which each policy of a race has: docs/decisions.md 0041
 REFINED = 0.03  # the step size at the end of a round of refinement, as a fraction of the search's
 JUDGED = 0.25  # the last part of a round, in which the steps are small, whose objectives say what it has gained
 
@@ -25,8 +26,9 @@ class SearchTable(NamedTuple):
     scenarios: Any  # [R] the iteration whose scenarios it is under: after the last step of a phase, the next one
     action: Any  # [R] STEP goes on from the candidate, along its gradient; EVALUATE compares costs
     # [R] CURRENT: what the search has now. To evaluate one of the others takes it in place of CURRENT, evaluated in the
-    # row before, if it costs no more: FRESH, a policy that knows nothing; START, what the search was given; COARSE,
-    # what the refinement started from. The last two are also taken where a cost is NaN; FRESH is not.
+    # row before, if it costs no more: FRESH, a policy that knows nothing; OTHER and LEADER, the second of a race and
+    # the first as it was (learn/race.py); START, what the search was given; COARSE, what the refinement started from.
+    # The last two are also taken where a cost is NaN; FRESH is not.
     candidate: Any
     refine: Any  # [R] whether the objective is the refining one
     counts: Any  # [R] whether a step's objective counts in the mean of its round of refinement
@@ -50,7 +52,8 @@ def search_table(
 ) -> SearchTable:
     """The table of searches of `steps` iterations each.
 
-    init: what a search starts from: the `previous` policy, a `fresh` one, or the `better` of both; else a ConfigError.
+    init: what a search starts from: the `previous` policy, a `fresh` one, the `better` of both, or of both after a race
+    of RACED of the iterations before `refine` each (`raced`); else a ConfigError.
     refine: the iteration from which it refines the better of what it found and what it was given, or those with which
     rounds of that begin, each of which may be the last (learn/rounds.py); None: never.
     cost_width_start: the cost's width at the start; it falls to 1, geometrically, by half of the coarse iterations.
@@ -62,15 +65,19 @@ def search_table(
     choice("init", init, INITS)
     rows = [(0, 0, EVALUATE, CURRENT), (0, 0, EVALUATE, FRESH)] if init == "better" else []
     bounds = [] if refine is None else sorted({*np.atleast_1d(refine).tolist(), steps})
+    heat = int(RACED * bounds[0]) if bounds and init == "raced" else 0
     for i in range(steps):
-        rows += [(i, i, STEP, FRESH if init == "fresh" and i == 0 else CURRENT)]
+        begins = OTHER if heat and i == heat else FRESH if i == 0 and (heat or init == "fresh") else CURRENT
+        rows += [(i, i, STEP, begins)]
+        if heat and i + 1 == 2 * heat:
+            rows += [(i, i + 1, EVALUATE, CURRENT), (i, i + 1, EVALUATE, LEADER)]
         if i + 1 in bounds:
             given = START if i + 1 == bounds[0] else COARSE
             rows += [(i, i + 1, EVALUATE, CURRENT), (i, i + 1, EVALUATE, given)]
     iteration, scenarios, action, candidate = np.array(rows, np.int32).reshape(-1, 4).T
     number = np.arange(anneal_trials + 1 if anneal_trials > 1 else 1)[:, None]
-    i = number * steps + scenarios  # [T, R] counted over all searches
-    coarse = bounds[0] if bounds else anneal_trials * steps
+    i = number * steps + scenarios - heat * (iteration >= heat)  # [T, R] counted over all searches, a race once
+    coarse = (bounds[0] if bounds else anneal_trials * steps) - heat
     width = cost_width_start ** np.maximum(0, 1 - i / (coarse / 2)) if coarse else np.ones(i.shape)
     refines = scenarios >= (bounds[0] if bounds else steps + 1)
     passed = np.interp(scenarios, bounds or [0], range(len(bounds) or 1)) % 1  # [R] of a round
@@ -81,8 +88,3 @@ def search_table(
     counts, ends = refines & (action == STEP) & (passed >= 1 - JUDGED), (candidate == COARSE) & (action == EVALUATE)
     flags = refines, counts, ends, np.zeros(len(rows), bool)
     return SearchTable(iteration, scenarios, action, candidate, *flags, width, step_size, limit)
-
-
-def first_rows(table: SearchTable) -> np.ndarray:
-    """[N+1] the row with which each iteration begins, and the number of rows."""
-    return np.searchsorted(table.iteration, np.arange(table.iteration.max(initial=-1) + 2)).astype(np.int32)

@@ -11,23 +11,10 @@ import optax
 
 from pegasus_jax.imagine.scenarios import Sampler
 from pegasus_jax.learn.gradient import SearchInfo
-from pegasus_jax.learn.rounds import Progress, unrefined
-from pegasus_jax.learn.schedule import FRESH, STEP, SearchTable, first_rows
-from pegasus_jax.learn.visits import Ascend, after, begun, of_search, only_refines, renewed, valued
+from pegasus_jax.learn.race import candidate, entered
+from pegasus_jax.learn.schedule import FRESH, STEP, SearchTable
+from pegasus_jax.learn.visits import Ascend, after, first_rows, initial, of_search, only_refines, renewed, valued
 from pegasus_jax.types import Array, Key, Params, PolicyOptimizer, TrainState
-
-
-class SearchState(NamedTuple):
-    """What a search knows beyond its parameters: with it, it goes on at any row of its table."""
-
-    optimizer: Any  # the state of the problem's optimizer
-    start: Params  # what the search, or its refinement, started from
-    last: Array  # [] the objective at the row before
-    no_improvement: Array  # [] whether the last search found nothing better than what it was given, before it refined
-    worked: Array  # [] how many searches in a row, this one included, were given a policy that works
-    progress: Progress  # of the rounds of its refinement
-    widening: Array  # [] how much wider than the table says the cost is: learn/widening.py
-    multiplier: Any = None  # [] of a constraint's penalty, kept from search to search; None: there is no constraint
 
 
 class Problem(NamedTuple):
@@ -47,14 +34,10 @@ class Problem(NamedTuple):
 def searcher(problem: Problem) -> PolicyOptimizer:
     """The searcher of a problem: its `run` is `search`, its learner's optimizer a `SearchState`."""
 
-    def init(params: Params) -> SearchState:
-        none = jnp.asarray(jnp.inf, float), jnp.zeros((), bool), jnp.int32(0), unrefined(), jnp.ones((), float)
-        return SearchState(problem.optimizer.init(params), params, *none, begun(problem.ascend))
-
     def run(*given: Any, works: Array | bool = False, **where: Any) -> tuple[TrainState, SearchInfo]:
         return search(*given, problem=problem._replace(works=works), **where)
 
-    return PolicyOptimizer(init, run)
+    return PolicyOptimizer(partial(initial, problem), run)
 
 
 def search(
@@ -72,8 +55,8 @@ def search(
 
     A search that only refines (`only_refines`) begins at the first that does, as 0, and one ends with a round of
     refinement that has gained nothing (learn/rounds.py); what it lacks is NaN in the info [n]. One call of n steps and
-    two of n/2, the second with first=n/2, do the same. `fresh` is a policy that the table may ask for. Raises
-    ValueError for more iterations than the table has, or no fresh policy.
+    two of n/2, the second with first=n/2, do the same. `fresh` are two policies [2, ...] that know nothing, for
+    a table that asks for them. Raises ValueError for more iterations than the table has, or no fresh policy.
     """
     table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)
     if steps > (most := len(begin) - 1):
@@ -95,9 +78,9 @@ def search(
     def visit(loop: tuple) -> tuple:
         k, learner, scenarios, info = loop
         now: SearchTable = jax.tree.map(lambda column: column[row + k], rows)
-        (own, state), choose, i = learner, partial(jax.lax.select_n, now.candidate), now.iteration - offset
-        visited = jax.tree.map(choose, own, fresh if asks else own, state.start, state.start)
-        value, gradient, weight = valued(problem, state, visited, posterior, scenarios, now)
+        learner, i = entered(now, learner, problem.optimizer), now.iteration - offset
+        visited = candidate(now, learner, fresh if asks else None)
+        value, gradient, weight = valued(problem, learner.optimizer, visited, posterior, scenarios, now)
         learner, cost, skipped = after(now, learner, visited, value, gradient, weight, problem)
         norm, stepped = optax.tree.norm(gradient), jnp.where(now.action == STEP, i, steps)
         scenarios = sampler.redraw(key, following[row + k], scenarios, posterior)

@@ -4,26 +4,46 @@ Where there is a constraint its multiplier ascends beside the policy's descent.
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from pegasus_jax.imagine.limits import FIRST
-from pegasus_jax.learn.rounds import after_row, unrefined
-from pegasus_jax.learn.schedule import FRESH, START, STEP, SearchTable
+from pegasus_jax.learn.race import leader_of, returned
+from pegasus_jax.learn.rounds import Progress, after_row, unrefined
+from pegasus_jax.learn.schedule import FRESH, LEADER, START, STEP, SearchTable
 from pegasus_jax.learn.updates import is_finite, update_if
 from pegasus_jax.learn.widening import after_step, widened
 from pegasus_jax.types import Array, Params, TrainState
+
+
+class SearchState(NamedTuple):
+    """What a search knows beyond its parameters: with it, it goes on at any row of its table."""
+
+    optimizer: Any  # the state of the problem's optimizer
+    start: Params  # what the search, or its refinement, started from
+    last: Array  # [] the objective at the row before
+    no_improvement: Array  # [] whether the last search found nothing better than what it was given, before it refined
+    worked: Array  # [] how many searches in a row, this one included, were given a policy that works
+    progress: Progress  # of the rounds of its refinement
+    widening: Array  # [] how much wider than the table says the cost is: learn/widening.py
+    leader: Any = None  # a `Leader` of a race; None: the table has none
+    multiplier: Any = None  # [] of a constraint's penalty, kept from search to search; None: there is no constraint
+
 
 # (multiplier, probability that an episode breaks the constraint) -> multiplier after a step; None: no constraint
 Ascend = Callable[[Array, Array], Array] | None
 
 
-def begun(ascend: Ascend) -> Array | None:
-    """The first multiplier []; None without a constraint."""
-    return None if ascend is None else jnp.asarray(FIRST, float)
+def initial(problem: Any, params: Params) -> SearchState:
+    """What is known before a problem's first search."""
+    none = jnp.asarray(jnp.inf, float), jnp.zeros((), bool), jnp.int32(0), unrefined(), jnp.ones((), float)
+    moments = problem.optimizer.init(params)
+    multiplier = None if problem.ascend is None else jnp.asarray(FIRST, float)
+    return SearchState(moments, params, *none, leader_of(problem.table, params, moments), multiplier)
 
 
 def renewed(problem: Any, learner: TrainState) -> TrainState:
@@ -38,10 +58,11 @@ def renewed(problem: Any, learner: TrainState) -> TrainState:
 def only_refines(table: SearchTable, worked: Array) -> Array:
     """Whether a search skips what comes before its refinement, where `worked` [] in a row were given what works.
 
-    Of a table that compares with a fresh policy the 1st, 2nd, 4th, 8th, ... of them do all of it, from that: one that
-    works may be far from the best, and then a refinement does not find that (docs/decisions.md 0035).
+    Of a table that compares with a fresh policy, or races with one, the 1st, 2nd, 4th, 8th, ... of them do all of it,
+    from that: one that works may be far from the best, and then a refinement does not find that (docs/decisions.md
+    0035).
     """
-    compares = ((table.candidate == FRESH) & (table.action != STEP)).any()
+    compares = ((table.candidate == FRESH) & (table.action != STEP) | (table.candidate == LEADER)).any()
     return worked & (worked - 1) != 0 if compares else worked > 0
 
 
@@ -72,8 +93,9 @@ def after(
     older = ~(state.last < value)
     # A fresh policy is also where a search begins that is to find another than the given one.
     fresh = (value <= state.last) | state.no_improvement | (state.worked > 0)
-    taken = jnp.stack([True, fresh, older, older])[row.candidate] | steps_now
-    params = optax.tree.where(taken, visited, params)
+    less = (value < state.last) | jnp.isnan(state.last)
+    taken = jnp.stack([True, fresh, True, less, older, older])[row.candidate] | steps_now
+    params, state = optax.tree.where(taken, visited, params), returned(row, taken, state)
     now = TrainState(params, state.optimizer)
     updates, moved = update_if(steps_now & finite, problem.optimizer, gradient, now, value=value)
     found = state._replace(
@@ -95,3 +117,8 @@ def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
     # Where all are alike there is no choice to make: of searches vmapped over `earlier` each would have its own.
     number = jnp.minimum(earlier, most) if (most := len(table.limit) - 1) else 0
     return SearchTable(*map(jnp.asarray, table[:-3]), *(jnp.asarray(column)[number] for column in table[-3:]))
+
+
+def first_rows(table: SearchTable) -> np.ndarray:
+    """[N+1] the row with which each iteration begins, and the number of rows."""
+    return np.searchsorted(table.iteration, np.arange(table.iteration.max(initial=-1) + 2)).astype(np.int32)

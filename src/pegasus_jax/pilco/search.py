@@ -133,9 +133,9 @@ def analytic(
 
         def cheaper(params: Params) -> Params:
             """These, or the fresh ones where those cost no more."""
-            both = jax.tree.map(lambda *leaves: jnp.stack(leaves), params, fresh)
-            own, other = jax.vmap(value)(both)
-            return optax.tree.where(other <= own, fresh, params)
+            one = jax.tree.map(lambda leaf: leaf[0], fresh)
+            own, other = jax.vmap(value)(jax.tree.map(lambda *leaves: jnp.stack(leaves), params, one))
+            return optax.tree.where(other <= own, one, params)
 
         new = jnp.asarray(first) == 0
         if restart:

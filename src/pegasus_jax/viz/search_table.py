@@ -2,7 +2,7 @@
 
 from pegasus_jax.learn.schedule import SearchTable
 
-ACTIONS, CANDIDATES = ("evaluate", "step"), ("current", "fresh", "start", "coarse")
+ACTIONS, CANDIDATES = ("evaluate", "step"), ("current", "fresh", "other", "leader", "start", "coarse")
 
 
 def text(table: SearchTable, search: int = 0) -> str:
