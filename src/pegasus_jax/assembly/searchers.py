@@ -169,7 +169,8 @@ def tabled(
     def run(*given: Any, **where: Any) -> tuple[TrainState, Any]:
         return searches(table()).run(*given, **where)
 
-    return PolicyOptimizer(searches(search_table(8, init=init, refine=8)).init, run)
+    like = search_table(8, init=init, refine=8)  # of another length, with a race where the real one has it
+    return PolicyOptimizer(searches(like).init, run)
 
 
 def refines_successes(search: settings.Search | settings.Analytic) -> bool:

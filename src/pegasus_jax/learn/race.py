@@ -45,17 +45,16 @@ def entered(row: SearchTable, learner: TrainState, optimizer: optax.GradientTran
     params, state = learner
     if state.leader is None:
         return learner
-    begins, now = (row.candidate == OTHER) & (row.action == STEP), Leader(params, state.optimizer, state.widening)
-    new = Leader(params, optimizer.init(params), jnp.ones_like(state.widening))
-    _, moments, widening = optax.tree.where(begins, new, now)
-    kept = optax.tree.where(begins, now, state.leader)
-    return TrainState(params, state._replace(optimizer=moments, widening=widening, leader=kept))
+    begins, own = (row.candidate == OTHER) & (row.action == STEP), (state.optimizer, state.widening)
+    moments, widening = optax.tree.where(begins, (optimizer.init(params), jnp.ones_like(state.widening)), own)
+    leader = optax.tree.where(begins, Leader(params, *own), state.leader)
+    return TrainState(params, state._replace(optimizer=moments, widening=widening, leader=leader))
 
 
 def returned(row: SearchTable, taken: Array, state: Any) -> Any:
     """The state with the moments and the width of the leader, where its policy is taken."""
     if state.leader is None:
         return state
-    now, won = Leader(None, state.optimizer, state.widening), (row.candidate == LEADER) & taken
-    _, moments, widening = optax.tree.where(won, state.leader._replace(params=None), now)
+    won, own = (row.candidate == LEADER) & taken, (state.optimizer, state.widening)
+    moments, widening = optax.tree.where(won, (state.leader.optimizer, state.leader.widening), own)
     return state._replace(optimizer=moments, widening=widening)
