@@ -12,8 +12,8 @@ from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenario
 from pegasus_jax.vectorized import for_particles
 
 # Platform -> steps of the time loop compiled as one. Each round of a loop costs a GPU copies and launches
-# (docs/decisions.md 0013); a CPU would only compile longer.
-UNROLL = {"gpu": 25}
+# (docs/decisions.md 0013), and more steps than these take it longer to compile; a CPU would only compile longer.
+UNROLL = {"gpu": 5}
 
 
 class NoiseUse(NamedTuple):

@@ -33,17 +33,20 @@ GRAPHS = {
 }
 # And side by side the kernels of a graph that do not wait for each other (docs/decisions.md 0013).
 CONCURRENT_KERNELS = {"xla_gpu_command_buffer_scheduling_mode": "CONCURRENT"}
+# To try several kernels for each of hundreds of small products takes half of the time to compile (the same decision).
+NO_AUTOTUNING = {"xla_gpu_autotune_level": 0, "xla_gpu_enable_triton_gemm": False}
+ON_GPU = GRAPHS | CONCURRENT_KERNELS | NO_AUTOTUNING
 
 # The compiler's options by platform. On a CPU what runs for milliseconds need not be compiled well: without
 # emitters it is ready in two thirds of the time, and a tenth slower. A fit or a search runs for seconds, and gains by
 # wide vectors; the compiler's highest level gains it nothing over the first, which takes a tenth less.
 FAST_COMPILE: dict[str, dict] = {
     "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
-    "gpu": GRAPHS | CONCURRENT_KERNELS,
+    "gpu": ON_GPU,
 }
 FAST_RUN: dict[str, dict] = {
     "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512},
-    "gpu": GRAPHS | CONCURRENT_KERNELS,
+    "gpu": ON_GPU,
 }
 # What runs once a trial, or a run: compiled in half of the time, it takes three times as long, some milliseconds more.
 ONCE = FAST_COMPILE | {"cpu": FAST_COMPILE["cpu"] | {"xla_backend_optimization_level": 0}}
