@@ -141,7 +141,9 @@ def alike(readings: np.ndarray, angles: tuple[int, ...] = (), names: tuple[str, 
     notes = []
     if still.any():
         same = ", ".join(names[i] for i in np.flatnonzero(still))
-        notes.append(f"after each of {count} resets the same: {same}; what never changes only costs time")
+        notes.append(
+            f"after each of {count} resets the same: {same}; right for a rate at rest, else a sensor may be dead"
+        )
     for i in range(size):
         earlier = {names[j]: readings[:, j] for j in range(i) if not still[j]}
         earlier |= {f"{f.__name__}({names[a]})": f(readings[:, a]) for a in angles if a != i for f in (np.sin, np.cos)}
