@@ -166,7 +166,7 @@ def learned(folder: Path, env: str, cost: str, **given: Any) -> Path:
     return folder
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_a_plant_seen_by_cosine_and_sine_is_learned_as_if_seen_by_its_angle(tmp_path: Path) -> None:
     """The same data to the last bit, and costs, searches and controls but for rounding. The folder keeps both."""
     first = learned(tmp_path / "circle", "Pendulum-v1", "upright")

@@ -78,7 +78,7 @@ def test_the_first_policy_is_learned_from_logs_and_all_goes_on_as_after_an_episo
     assert restored(whole, "best")[2].trial in (1, 2, 3)
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_killed_before_its_first_trial_it_needs_the_logs_no_more(place: Path, whole: Path, tmp_path: Path) -> None:
     """kill -9 as soon as config.yaml is there; then the files are gone, and the run ends bit-equal."""
     shutil.copytree(place, tmp_path, dirs_exist_ok=True, ignore=shutil.ignore_patterns("whole"))

@@ -93,7 +93,7 @@ def command(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run([*program, *map(str, words)], cwd=cwd, capture_output=True, text=True, check=False)
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_learns_and_resumes_from_the_command_line(tmp_path: Path) -> None:
     (tmp_path / "cart.xml").write_text(PENDULUM.read_text())
     words = ["task=mjcf", "mjcf=cart.xml", "cost=costs:upright", "dt=0.04", "horizon=8", "angles=[1]", *TINY]

@@ -32,7 +32,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return a_run(tmp_path_factory.mktemp("runs") / "run", trials=1)
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_a_film_of_a_tiny_run(run: Path) -> None:
     done = call("play", run, "seed=3", cwd=run.parent, **OPTIMISED)
     assert (done.returncode, done.stderr.startswith("best policy: trial 1")) == (0, True), done.stderr
@@ -71,7 +71,7 @@ def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
     assert drawn.std() > 0  # something is to be seen
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_a_film_replaces_a_link_and_what_it_leads_to_stays(run: Path, tmp_path: Path) -> None:
     """Neither where the film goes nor where it is written is a file that was there opened."""
     kept = tmp_path / "kept"

@@ -124,7 +124,7 @@ def test_what_it_learned_is_a_function(learned: Path, monkeypatch: pytest.Monkey
         controller("nowhere")
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None:
     """In the second of two episodes of five steps. Its two whole rows are kept, and resuming learns from them."""
     code, _, err = call("train", *WORDS, *TINY, "horizon=5", "out=run", cwd=tmp_path, BREAKS=8)

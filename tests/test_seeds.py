@@ -150,7 +150,7 @@ print(sum("XLAEigen" in path.read_text() for path in pathlib.Path("/proc/self/ta
     assert int(found.stdout) == (threads or machine.cpus())
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_killed_and_resumed_is_bit_equal(study: Path, tmp_path: Path) -> None:
     """Killed when one seed's second episode is on disk and the other's perhaps not."""
     folder = tmp_path / "killed"
@@ -178,7 +178,7 @@ def alike(study: Path, other: Path) -> None:
                 assert a[name] == pytest.approx(b[name], abs=2e-4), (seed, name)
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_path: Path) -> None:
     """Four devices made of this CPU, two for the seeds and two for the particles; resumed on one device."""
     folder, words = tmp_path / "mesh", [*WORDS, "trials=1", "seeds=2", "mesh=2x2"]
@@ -188,7 +188,7 @@ def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_
     alike(study, folder)
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_processes_that_act_as_one_machine_change_nothing(study: Path, tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("localhost", 0))
@@ -223,7 +223,7 @@ def test_devices_that_are_not_there_are_one_clear_line(word: str, message: str, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.campaign
+@pytest.mark.slow
 def test_a_folder_of_seeds_is_drawn_and_kept(study: Path) -> None:
     plotted = call("plot", study, cwd=study.parent)
     assert plotted.returncode == 0, plotted.stderr
