@@ -10,7 +10,7 @@ STAMP := $(VENV)/.installed
 CODE  := $(wildcard src envs tests benchmarks examples)
 
 # Tests start hundreds of processes: without bytecode each of them compiles the source of all that it imports, for a second.
-export PYTHONDONTWRITEBYTECODE :=
+test test-slow campaigns: export PYTHONDONTWRITEBYTECODE :=
 
 # A file's tests share what they compile, so a file stays on one core.
 PYTEST := $(BIN)/python -m pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations 10
