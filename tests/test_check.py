@@ -87,6 +87,16 @@ def test_it_says_what_a_robot_is_like_and_moves_nothing(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir() if path.name not in ("robot.py", "__pycache__")] == ["asked.log"]
 
 
+def test_the_cost_where_episodes_start_is_the_average_of_them(tmp_path: Path) -> None:
+    """Not the cost of their mean, which is the goal here."""
+    wide = ["env=robot:Arm-v0", "cost=robot:cost", "start_mean=[0,0]", "start_std=[1.5]"]
+    code, said, _ = call("check", *wide, cwd=tmp_path)
+    assert code == 0, said
+    (told,) = (line.split()[2] for line in said.splitlines() if "cost there" in line)
+    angles = np.random.default_rng(1).normal(0, 1.5, 100_000)
+    assert float(told) == pytest.approx(np.mean(1 - np.exp(-2 * (1 - np.cos(angles)))), abs=0.08)
+
+
 @pytest.mark.parametrize("command", ["check", "train"])
 @pytest.mark.parametrize(
     ("words", "says", "asks"),

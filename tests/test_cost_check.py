@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.imagine import costs as imagined
 from pegasus_jax.tasks import cost_check, user_code
+from pegasus_jax.types import Cost
 
 COSTS = """
 import jax, jax.numpy as jnp, numpy as np, math
@@ -137,10 +139,13 @@ def test_a_cost_above_one_is_only_noted():
     assert "success=0.2" in note
 
 
-@pytest.mark.parametrize(("width", "flat"), [(10.0, True), (100.0, False)])
-def test_a_cost_that_is_flat_where_episodes_start_is_noted(width, flat):
-    far = facts((0, 0), (0.1, 0.1), ())
-    found = cost_check.notes(lambda x: 1 - jnp.exp(-(((x[0] - 100) / width) ** 2) / 2), far, "cost=x:y")
+@pytest.mark.parametrize(
+    ("width", "factor", "flat"), [(10, 1, True), (10, 3, True), (20, 1, True), (20, 2.3, False), (100, 1, False)]
+)
+def test_a_cost_that_is_flat_where_episodes_start_also_as_a_search_sees_it_is_noted(width, factor, flat):
+    far, cost = facts((0, 0), (0.1, 0.1), ()), Cost(lambda x: 1 - jnp.exp(-(((x[0] - 100) / width) ** 2) / 2))
+    seen = imagined.widened(cost, factor).of_state
+    found = cost_check.flat(cost.of_state, far, "cost=x:y", seen)
     assert ["is 1 where episodes start and changes by" in note for note in found] == [True] * flat
 
 

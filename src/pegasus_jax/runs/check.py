@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import tasks
+from pegasus_jax.assembly.schedules import at_starts, width_of
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config, Search
+from pegasus_jax.imagine import costs
 from pegasus_jax.math.circles import entries
 from pegasus_jax.math.units import parted
 from pegasus_jax.policies.rate_limited import largest_change
@@ -47,7 +49,10 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     if config.cost is None:
         return [*rates, *limits]
     beside = cost_check.beside(facts, task)
-    notes = [*cost_check.notes(task.cost.of_state, beside, f"cost={shown(config.cost)}"), *limits]
+    what = f"cost={shown(config.cost)}"
+    notes = cost_check.notes(task.cost.of_state, beside, what)
+    seen = costs.widened(task.cost, width(config, task)).of_state
+    notes += [*cost_check.flat(task.cost.of_state, beside, what, seen), *limits]
     stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)
@@ -176,7 +181,7 @@ def report(config: Config) -> list[str]:
     task = build(replace(first.loaded(config), seed=0)).task
     notes = circles_found(asked, config) + before_training(config, task, 1 if given else RESETS)
     notes += read_config(config, task)[1]
-    start = jnp.asarray(task.start_mean, float)
+    wide = width(config, task)
     facts: dict[str, Any] = {
         "task": " ".join([config.task, *([task.name] if task.name != config.task else [])]),
         **tasks.described(config),
@@ -192,20 +197,17 @@ def report(config: Config) -> list[str]:
         "time": f"{task.horizon} periods of {task.dt:g} s an episode, {task.horizon * task.dt:g} s"
         + ("" if asked.horizon else "; horizon= changes that"),
         "start": f"{_numbers(task.start_mean)}, give or take {_numbers(task.start_std)}",
-        "cost there": f"{float(task.cost.of_state(start)):.4g}; below {task.success:g} is success"
-        + widened(config, task),
+        "cost there": f"{np.mean(at_starts(task)):.4g} on average; below {task.success:g} is success"
+        + (f"; searches begin with a cost {wide:.2g} times as wide" if wide > 1.05 else ""),
     }
     verdict = "no error" + ("; the notes may matter" if notes else "")
     lines = [*facts.items(), *(("note", note) for note in notes), ("found", verdict)]
     return [f"{name:>12}  {value}" for name, value in lines]
 
 
-def widened(config: Config, task: Task) -> str:
-    """How much wider the cost is where a search begins, if it is."""
-    from pegasus_jax.assembly.schedules import at_starts, width_of
-
-    width = width_of(config.search, partial(at_starts, task)) if isinstance(config.search, Search) else 1.0
-    return f"; searches begin with a cost {width:.2g} times as wide" if width > 1.05 else ""
+def width(config: Config, task: Task) -> float:
+    """How much wider than the task's the cost is where a search begins."""
+    return width_of(config.search, partial(at_starts, task)) if isinstance(config.search, Search) else 1.0
 
 
 def _numbers(values: Any) -> str:
