@@ -23,10 +23,21 @@ SECOND = FIRST | {"trial": 5, "saturated": 0.96, "episode_cost": 0.96}
 def test_a_flat_cost_and_a_wrong_model_are_told_apart() -> None:
     (flat,), (wrong,) = stuck([FIRST], [SECOND]), stuck([FIRST | {"objective_fresh": 0.3}], [SECOND])
     for line in (flat, wrong):
-        assert line.startswith("note: the controls of trials 4 and 5 were at their limits")
+        assert line.startswith("note: the controls stayed at a limit in trials 4 and 5")
         assert "(cost 0.96)" in line
     assert "the cost may be flat" in flat
     assert "imagined was 0.30: the model is wrong there" in wrong
+
+
+def test_the_one_control_of_several_that_pushes_is_named() -> None:
+    """As a car's that always turns right: by the share of all controls it would not be seen."""
+    first, second = ({"saturated": 0.5, "saturated_controls": {"gas": gas, "wheel": 1.0}} for gas in (0.96, 0.0))
+    (line,) = stuck([FIRST | first], [SECOND | second])
+    assert line.startswith("note: wheel stayed at a limit in trials 4 and 5")
+    assert stuck([FIRST | first], [SECOND | second | {"saturated_controls": {"gas": 0.96, "wheel": 0.9}}]) == [
+        line.replace("wheel", "gas")
+    ]
+    assert not stuck([FIRST | first], [SECOND | second | {"saturated_controls": {"gas": 0.9, "wheel": 0.9}}])
 
 
 @pytest.mark.parametrize("change", [{"random": True}, {"saturated": 0.94}, {"episode_cost": 0.4}])
@@ -52,11 +63,11 @@ def test_a_run_says_it_once_for_each_two_trials(monkeypatch: pytest.MonkeyPatch)
     experiment = SimpleNamespace(task=SimpleNamespace(environment=None))
     job = SimpleNamespace(program=SimpleNamespace(concurrent=True), experiment=experiment, **given)
     train.learn(cast(Any, job), cast(Any, None))
-    assert [line[:40] for line in said] == [
+    assert [line[:42] for line in said] == [
         "trial 1",
         "trial 2",
         "trial 3",
-        "note: the controls of trials 2 and 3 wer",
+        "note: the controls stayed at a limit in tr",
         "trial 4",
-        "note: the controls of trials 3 and 4 wer",
+        "note: the controls stayed at a limit in tr",
     ]

@@ -41,12 +41,14 @@ def driven(keys: Key, params: Params, task: Task, program: Program) -> np.ndarra
     return np.reshape(costs, (keys.shape[1], keys.shape[0], task.horizon)).swapaxes(0, 1)
 
 
-def saturated(u: Any, task: Task) -> np.ndarray:
-    """Fraction of the controls [..., H, U] of episodes that are within 1 % of a limit [...]."""
+def saturated(u: Any, task: Task) -> dict[str, Any]:
+    """The share of an episode's controls [H, U] that are within 1 % of a limit: of all, and of each by its name."""
     low, high = np.asarray(task.control_low), np.asarray(task.control_high)
     margin = 0.01 * (high - low)
     u = np.asarray(u)
-    return np.mean((u < low + margin) | (u > high - margin), axis=(-2, -1))
+    shares = np.mean((u < low + margin) | (u > high - margin), axis=0)
+    each = dict(zip(task.control_names, shares.tolist(), strict=True))
+    return {"saturated": float(np.mean(shares)), "saturated_controls": each}
 
 
 def kept_to(ran: Episode, task: Task) -> dict[str, Any]:

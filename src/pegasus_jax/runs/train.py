@@ -180,7 +180,7 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, Result]
                 **measured[index],
                 **found[index],
                 **kept_to(ran, task),
-                "saturated": float(saturated(ran.trajectory.u, task)),
+                **saturated(ran.trajectory.u, task),
                 "calibration": known(calibration[index]),
                 "seconds": seconds,
             }
@@ -204,7 +204,7 @@ def of_logs(job: Job, states: RunState) -> tuple[RunState, Result]:
         measured, seconds = evaluation()
         own = {"trial": 1, "plant_seconds": 0.0, "random": False, "policy": 0, **logged.told(logs, task)}
         controls = np.concatenate([one.trajectory.u for one in logs])
-        rest = {"saturated": float(saturated(controls, task)), "calibration": None, "seconds": seconds}
+        rest = {**saturated(controls, task), "calibration": None, "seconds": seconds}
         return [{**own, **worth, **learned, **rest} for worth, learned in zip(measured, found, strict=True)]
 
     return states, rows
