@@ -44,8 +44,8 @@ ROWS = (
         own_cost,
     ),
     Row("the same with a mechanism", "cartpole", ("cartpole-own_cost-mechanism",), own_cost),
-    Row("double cart-pole, on a GPU", "double_cartpole_gpu", ("double_cartpole-reheated",)),
-    Row("double cart-pole, on a CPU", "double_cartpole", ("double_cartpole-integrated",)),
+    Row("double cart-pole, eight policies, on a GPU", "double_cartpole_gpu", ("double_cartpole-reheated",)),
+    Row("double cart-pole, one policy", "double_cartpole", ("double_cartpole-default",)),
     Row(
         "swimmer, knife edge",
         "swimmer_knife_edge",
