@@ -49,6 +49,10 @@ def test_episodes_end_where_their_user_says(name: str) -> None:
         ("InvertedPendulum-v5", [0, 0, 0, 0]),
         ("InvertedDoublePendulum-v5", [0, 0, 0, 1, 1, 0, 0, 0, 0]),
         ("CartPole", [0, 0, 0, np.pi]),
+        ("Quadrotor", [0, 0, 0, 0, 0, 0]),
+        ("BallOnBeam", [0, 0, 0, 0]),
+        ("FourTanks", [12, 14, 0, 0]),
+        ("Car", [0, 0, 0, 0]),
     ],
 )
 def test_a_cost_is_least_at_the_goal(name: str, goal: list[float]) -> None:
@@ -56,6 +60,46 @@ def test_a_cost_is_least_at_the_goal(name: str, goal: list[float]) -> None:
     assert cost(jnp.array(goal, float)) == pytest.approx(0, abs=1e-6)
     starts = [cost(jnp.asarray(env.reset(seed=seed)[0], float)) for seed in range(5)]
     assert 0 < min(starts) <= max(starts) <= 1
+
+
+def driven(name: str, start: list[float], control: list[float], periods: int) -> np.ndarray:
+    """The state [D] of a plant that is written by hand, after so many periods of one control."""
+    env = gymnasium.make(PLANTS[name].env)
+    env.reset(seed=0)
+    plant: Any = env.unwrapped
+    plant.s = np.array(start, float)
+    for _ in range(periods):
+        _, reward, *_ = env.step(np.array(control, np.float32))
+        assert reward == pytest.approx(1 - float(function(name, "cost")(jnp.asarray(plant.s))), abs=1e-5)
+    return plant.s
+
+
+def test_a_quadrotor_hovers_under_its_weight_and_falls_without() -> None:
+    np.testing.assert_allclose(driven("Quadrotor", [0.0] * 6, [0.5 * 9.81 / 2] * 2, 20), 0, atol=1e-5)
+    assert driven("Quadrotor", [0.0] * 6, [0.0, 0.0], 20)[1] == pytest.approx(-9.81 / 2, rel=1e-4)
+
+
+def test_a_ball_begins_to_roll_as_on_a_slope_and_stops_at_the_beams_end() -> None:
+    """5 / 7 of what would slide; nothing holds the beam, so only the first period is a slope's."""
+    assert driven("BallOnBeam", [0.0, 0.1, 0.0, 0.0], [0.0], 1)[2] == pytest.approx(
+        -5 / 7 * 9.81 * np.sin(0.1) * 0.05, rel=0.02
+    )
+    assert driven("BallOnBeam", [0.0, 0.1, 0.0, 0.0], [0.0], 60)[[0, 2]] == pytest.approx([-0.5, 0])
+
+
+def test_four_tanks_rest_where_their_paper_says() -> None:
+    """Johansson (2000), table 2: 12.4, 12.7, 1.8 and 1.4 cm at 3 V, rounded."""
+    np.testing.assert_allclose(
+        driven("FourTanks", [12.4, 12.7, 1.8, 1.4], [3.0, 3.0], 100), [12.4, 12.7, 1.8, 1.4], rtol=0.1
+    )
+
+
+def test_a_car_drives_on_a_circle() -> None:
+    """Of .5 m / tan(steering), around a place beside it; without gas only friction changes its speed."""
+    x, y, heading, speed = driven("Car", [0.0, 0.0, 0.0, 1.0], [0.0, 0.3], 10)
+    radius = 0.5 / np.tan(0.3)
+    np.testing.assert_allclose([x, y], [radius * np.sin(heading), radius * (1 - np.cos(heading))], atol=1e-4)
+    assert speed == pytest.approx(np.exp(-0.1 * 2), rel=1e-4)
 
 
 def test_the_cart_pole_is_the_projects_own() -> None:

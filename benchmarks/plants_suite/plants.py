@@ -23,6 +23,7 @@ class Plant(NamedTuple):
     by: float  # plant time at which the bar is to be reached [s]
 
 
+HAND = "benchmarks.plants_suite.by_hand:"
 DM = "benchmarks.plants_suite.of_dm_control:dm_control/"
 IP, IDP = "InvertedPendulum-v5", "InvertedDoublePendulum-v5"
 PLANTS: dict[str, Plant] = {
@@ -50,4 +51,13 @@ PLANTS: dict[str, Plant] = {
     "CartPole": Plant(
         "pegasus_envs:pegasus/CartPoleSwingUp-v0", task(25, "cartpole", angles="[3]", rates="[1,2]"), 15, -12.5, 20.0
     ),
+    # Held back. The most is 200, one for each period.
+    "Quadrotor": Plant(
+        f"{HAND}Quadrotor-v0", task(40, "quadrotor", angles="[2]", module="by_hand", rates="[3,4,5]"), 6, 180.0, 12.0
+    ),
+    "BallOnBeam": Plant(
+        f"{HAND}BallOnBeam-v0", task(50, "ball_on_beam", module="by_hand", rates="[2,3]"), 14, 180.0, 20.0
+    ),
+    "FourTanks": Plant(f"{HAND}FourTanks-v0", task(40, "four_tanks", module="by_hand"), 5, 180.0, 1000.0),
+    "Car": Plant(f"{HAND}Car-v0", task(30, "car", angles="[2]", module="by_hand"), 12, 180.0, 72.0),
 }
