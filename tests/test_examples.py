@@ -13,6 +13,7 @@ from test_docs import blocks, commands, shell, tools  # noqa: F401 (tools is a f
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
 SCRIPTS = sorted(EXAMPLES.glob("*.py"))
+PAGES_HAVE_NOT = ("own_model_in_jit", "own_robot")  # what the others do, pages do too
 COMMANDS = [command for block in blocks(EXAMPLES / "README.md") for command in commands(block)]
 SMALL = "trials=2 fit=3 search=2"  # of a script's own words
 SETTINGS = "trials=2 fit.steps=3 search.steps=4 model.hidden=[8] policy.hidden=[8]"  # of a command
@@ -36,7 +37,13 @@ def commands_of(script: Path) -> list[str]:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "script",
+    [
+        pytest.param(path, id=path.stem, marks=() if path.stem in PAGES_HAVE_NOT else pytest.mark.campaign)
+        for path in SCRIPTS
+    ],
+)
 def test_an_example_runs_as_it_stands(script: Path, folder: Path, tools: dict[str, str]) -> None:  # noqa: F811
     before = {path.name for path in folder.iterdir()}
     for command in commands_of(script):
@@ -63,7 +70,7 @@ def test_the_examples_of_the_api_reference_run(program: Path, tmp_path: Path, to
     shell(f"python {program}", tmp_path, tools)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_model_of_ones_own_learns(folder: Path, tools: dict[str, str]) -> None:  # noqa: F811
     """Its first episode is random; from the second on the cart is brought to its goal, as the model expected."""
     shell("python own_model_in_jit.py > said", folder, tools)

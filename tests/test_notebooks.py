@@ -35,8 +35,14 @@ def test_notebooks_are_short_and_are_stored_with_their_pictures() -> None:
         assert (FOLDER / f"{name}.ipynb").stat().st_size < 250_000
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(NAMES))
+# One is run for every change; the others take as long again each.
+RUN = [
+    pytest.param("own_plant", marks=pytest.mark.slow),
+    *(pytest.param(name, marks=pytest.mark.campaign) for name in sorted(NAMES - {"own_plant"})),
+]
+
+
+@pytest.mark.parametrize("name", RUN)
 def test_a_notebook_runs(name: str, tmp_path: Path) -> None:
     nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
     stored = nbformat.read(FOLDER / f"{name}.ipynb", as_version=4)

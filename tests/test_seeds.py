@@ -179,7 +179,7 @@ def alike(study: Path, other: Path) -> None:
                 assert a[name] == pytest.approx(b[name], abs=2e-4), (seed, name)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_path: Path) -> None:
     """Four devices made of this CPU, two for the seeds and two for the particles; resumed on one device."""
     folder, words = tmp_path / "mesh", [*WORDS, "trials=1", "seeds=2", "mesh=2x2"]
@@ -189,7 +189,7 @@ def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_
     alike(study, folder)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_processes_that_act_as_one_machine_change_nothing(study: Path, tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("localhost", 0))
