@@ -24,8 +24,9 @@ def stuck(before: Sequence[dict[str, Any]], now: Sequence[dict[str, Any]]) -> li
     imagined, cost = first["objective_fresh"], second["episode_cost"]
     if imagined is None or imagined >= AS_BAD * cost:
         why = (
-            "the search finds nothing better: the cost may be flat where the plant is, so let it fall from farther away"
-            " (docs/robot.md), the limits may be too narrow for the task, or another seed= gets around it"
+            "the search has found nothing better; go on for some trials. If it stays so, the cost may be flat where the"
+            " plant is, so let it fall from farther away (docs/robot.md), the limits may be too narrow for the task, or"
+            " another seed= gets around it"
         )
     else:
         why = (
