@@ -3,6 +3,7 @@
 `gymnasium.make("benchmarks.plants_suite.by_hand:Quadrotor-v0")`. A reward is 1 minus the cost beside the plant.
 """
 
+from abc import abstractmethod
 from typing import Any
 
 import gymnasium
@@ -52,9 +53,9 @@ class ByHand(gymnasium.Env):
         self.action_space = Box(np.float32(self.low), np.float32(self.high))
         self.costs = jax.jit(type(self).cost)
 
+    @abstractmethod
     def rates(self, s: np.ndarray, u: np.ndarray) -> np.ndarray:
         """ds/dt [D]."""
-        raise NotImplementedError
 
     def within(self, s: np.ndarray) -> np.ndarray:
         """The state that stops let through [D]."""
