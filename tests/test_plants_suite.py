@@ -88,7 +88,7 @@ def test_a_ball_begins_to_roll_as_on_a_slope_and_stops_at_the_beams_end() -> Non
 
 
 def test_four_tanks_rest_where_their_paper_says() -> None:
-    """Johansson (2000), table 2: 12.4, 12.7, 1.8 and 1.4 cm at 3 V, rounded."""
+    """The operating point of Johansson (2000): 12.4, 12.7, 1.8 and 1.4 cm at 3 V, rounded."""
     np.testing.assert_allclose(
         driven("FourTanks", [12.4, 12.7, 1.8, 1.4], [3.0, 3.0], 100), [12.4, 12.7, 1.8, 1.4], rtol=0.1
     )

@@ -63,11 +63,11 @@ def test_a_run_says_it_once_for_each_two_trials(monkeypatch: pytest.MonkeyPatch)
     experiment = SimpleNamespace(task=SimpleNamespace(environment=None))
     job = SimpleNamespace(program=SimpleNamespace(concurrent=True), experiment=experiment, **given)
     train.learn(cast(Any, job), cast(Any, None))
-    assert [line[:42] for line in said] == [
+    assert [line[:55] for line in said] == [
         "trial 1",
         "trial 2",
         "trial 3",
-        "note: the controls stayed at a limit in tr",
+        "note: the controls stayed at a limit in trials 2 and 3,",
         "trial 4",
-        "note: the controls stayed at a limit in tr",
+        "note: the controls stayed at a limit in trials 3 and 4,",
     ]

@@ -1,7 +1,6 @@
 """pegasus-check: what a task is like, and what would go wrong, before anything moves; pegasus-train asks it first."""
 
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -49,10 +48,8 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     if config.cost is None:
         return [*rates, *limits]
     beside = cost_check.beside(facts, task)
-    what = f"cost={shown(config.cost)}"
-    notes = cost_check.notes(task.cost.of_state, beside, what)
-    seen = costs.widened(task.cost, width(config, task)).of_state
-    notes += [*cost_check.flat(task.cost.of_state, beside, what, seen), *limits]
+    seen = lambda: costs.widened(task.cost, width(config, at_starts(task))).of_state  # noqa: E731
+    notes = [*cost_check.notes(task.cost.of_state, beside, f"cost={shown(config.cost)}", seen), *limits]
     stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)
@@ -181,7 +178,7 @@ def report(config: Config) -> list[str]:
     task = build(replace(first.loaded(config), seed=0)).task
     notes = circles_found(asked, config) + before_training(config, task, 1 if given else RESETS)
     notes += read_config(config, task)[1]
-    wide = width(config, task)
+    wide = width(config, begun := at_starts(task))
     facts: dict[str, Any] = {
         "task": " ".join([config.task, *([task.name] if task.name != config.task else [])]),
         **tasks.described(config),
@@ -197,7 +194,7 @@ def report(config: Config) -> list[str]:
         "time": f"{task.horizon} periods of {task.dt:g} s an episode, {task.horizon * task.dt:g} s"
         + ("" if asked.horizon else "; horizon= changes that"),
         "start": f"{_numbers(task.start_mean)}, give or take {_numbers(task.start_std)}",
-        "cost there": f"{np.mean(at_starts(task)):.4g} on average; below {task.success:g} is success"
+        "cost there": f"{np.mean(begun):.4g} on average; below {task.success:g} is success"
         + (f"; searches begin with a cost {wide:.2g} times as wide" if wide > 1.05 else ""),
     }
     verdict = "no error" + ("; the notes may matter" if notes else "")
@@ -205,9 +202,9 @@ def report(config: Config) -> list[str]:
     return [f"{name:>12}  {value}" for name, value in lines]
 
 
-def width(config: Config, task: Task) -> float:
-    """How much wider than the task's the cost is where a search begins."""
-    return width_of(config.search, partial(at_starts, task)) if isinstance(config.search, Search) else 1.0
+def width(config: Config, begun: np.ndarray) -> float:
+    """How much wider than the task's the cost is where a search begins, by what it is `begun` [N] where episodes do."""
+    return width_of(config.search, lambda: begun) if isinstance(config.search, Search) else 1.0
 
 
 def _numbers(values: Any) -> str:

@@ -49,10 +49,13 @@ def beside(facts: Facts, task: Task) -> Facts:
     )
 
 
-def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
+def notes(
+    cost: Callable[[Any], Any], facts: Facts, what: str, seen: Callable[[], Callable[[Any], Any]] | None = None
+) -> list[str]:
     """What its owner should know of a cost. Raises ConfigError, beginning with `what`, if it cannot be learned from.
 
-    It is traced once, and evaluated with its gradient at the start, at zero and at 100 points around them.
+    It is traced once, and evaluated with its gradient at the start, at zero and at 100 points around them. Where it is
+    flat, `seen` () makes the cost that a search begins with, wider, which may not be flat.
     """
     _traced(cost, facts, what)
     points, values, slopes = _evaluated(cost, facts, what)
@@ -73,18 +76,13 @@ def notes(cost: Callable[[Any], Any], facts: Facts, what: str) -> list[str]:
             f"{what} is {values[most]:.3g} at {_text(points[most], facts)}, more than 1: success then means an episode"
             f" whose last five steps cost less than success={facts.success:g} on average; 1 - jnp.exp(-cost) is below 1"
         )
+    flat = (change := np.ptp(_around(cost, facts))) < FLAT < values[0]
+    if flat and (seen is None or np.ptp(_around(seen(), facts)) < FLAT):
+        found.append(
+            f"{what} is {values[0]:.3g} where episodes start and changes by {change:.1g} around there: a search finds"
+            " nothing to follow; let it fall from the start to the goal, as a wider exp does"
+        )
     return found
-
-
-def flat(cost: Callable[[Any], Any], facts: Facts, what: str, seen: Callable[[Any], Any]) -> list[str]:
-    """The note on a cost that leads nowhere from where episodes start, also as a search sees it: wider at first."""
-    value, change = float(cost(jnp.asarray(facts.start_mean, float))), np.ptp(_around(seen, facts))
-    if not change < FLAT < value:
-        return []
-    return [
-        f"{what} is {value:.3g} where episodes start and changes by {change:.1g} around there: a search finds"
-        " nothing to follow; let it fall from the start to the goal, as a wider exp does"
-    ]
 
 
 def _around(cost: Callable[[Any], Any], facts: Facts) -> np.ndarray:
