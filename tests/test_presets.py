@@ -54,6 +54,7 @@ SECTIONS = {
     "model": {"model", "fit"},
     "policy": {"policy"},
     "algorithm": {"model", "policy", "fit", "search", "x64"},
+    "effort": {"search"},
 }
 
 
@@ -81,9 +82,27 @@ def test_the_gpus_preset_is_the_double_cartpoles_with_eight_policies():
     assert parse("preset=double_cartpole_gpu model=log_normal") == preset("double_cartpole_network")
 
 
+def test_an_effort_is_a_number_of_iterations_or_of_policies_whatever_the_plant():
+    for task in ("gym", "mjcf", "cartpole", "double_cartpole", "swimmer_corkscrew"):
+        usual = preset(task).search
+        assert preset(task, effort="laptop").search == usual
+        assert preset(task, effort="workstation").search == dataclasses.replace(usual, steps=2 * usual.steps)
+        assert preset(task, effort="gpu").search == dataclasses.replace(usual, num_starts=4)
+    of_gaussians = dict(model="gp", policy="rbf", algorithm="pilco")
+    assert preset("cartpole", **of_gaussians, effort="workstation").search.steps == 600
+
+
+def test_single_settings_come_after_an_effort():
+    assert parse("task=gym effort=workstation search.steps=30").search.steps == 30
+    assert preset("cartpole", effort="gpu", settings={"search.num_starts": 3}).search.num_starts == 3
+
+
 @pytest.mark.parametrize(
     ("text", "part"),
     [
+        ("effort=laptops", "effort=laptops is unknown; did you mean 'laptop'?"),
+        ("effort=gpu model=gp policy=rbf algorithm=pilco", "effort=gpu is policies side by side"),
+        ("effort=gpu algorithm=paper", "search.num_starts=4 begins every search with fresh policies"),
         ("preset=cartpol", "preset=cartpol is unknown; did you mean 'cartpole'?"),
         ("preset=cartpole task=gym", "preset=cartpole is for task=cartpole, not task=gym; the nearest is preset=gym"),
         ("preset=swimmer_belly_up legs=6", "preset=swimmer_belly_up is for legs=2; with legs=6 leave out preset="),

@@ -1,7 +1,7 @@
 """The presets: whole configs, a value each, and the words that change whole sections of one.
 
-A command begins with a preset, its task's own or the one that `preset=` names. `model=`, `algorithm=` and `policy=`
-change it in this order; single keys come last. Imports neither JAX nor a simulator, so that a command says
+A command begins with a preset, its task's own or the one that `preset=` names. `model=`, `algorithm=`, `policy=` and
+`effort=` change it in this order; single keys come last. Imports neither JAX nor a simulator, so that a command says
 what it will do before it waits for them.
 """
 
@@ -227,20 +227,41 @@ ALGORITHMS: dict[str, Change] = {
     "pilco": lambda config: replace(config, search=Analytic(particles=config.search.particles), x64=True),
 }
 
-WORDS = {"preset": PRESETS, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS}
+
+def _four_policies(config: Config) -> Config:
+    if not isinstance(config.search, Search):
+        raise ConfigError(
+            "effort=gpu is policies side by side, of which this search has one; the nearest is effort=laptop"
+        )
+    return replace(config, search=replace(config.search, num_starts=4))
+
+
+# How much computing a trial is worth: docs/decisions.md 0042.
+EFFORTS: dict[str, Change] = {
+    "laptop": lambda config: config,
+    "workstation": lambda config: replace(config, search=replace(config.search, steps=2 * config.search.steps)),
+    "gpu": _four_policies,
+}
+
+WORDS = {"preset": PRESETS, "model": MODELS, "policy": POLICIES, "algorithm": ALGORITHMS, "effort": EFFORTS}
 
 
 def preset(
-    name: str = "cartpole", *, model: str | None = None, policy: str | None = None, algorithm: str | None = None
+    name: str = "cartpole",
+    *,
+    model: str | None = None,
+    policy: str | None = None,
+    algorithm: str | None = None,
+    effort: str | None = None,
 ) -> Config:
     """What a command with these words begins with: preset("cartpole") is the config of pegasus-train task=cartpole.
 
-    `model`, `policy` and `algorithm` are the command line's words. A model that is not the preset's own, and every
-    algorithm but "pegasus", change the preset NAME_network where there is one: what was tuned for one says nothing of
-    another.
+    `model`, `policy`, `algorithm` and `effort` are the command line's words. A model that is not the preset's own, and
+    every algorithm but "pegasus", change the preset NAME_network where there is one: what was tuned for one says
+    nothing of another.
     Raises ConfigError for an unknown word, in one line with the nearest one.
     """
-    said = {"preset": name, "model": model, "policy": policy, "algorithm": algorithm}
+    said = {"preset": name, "model": model, "policy": policy, "algorithm": algorithm, "effort": effort}
     for word, value in said.items():
         if value is not None and value not in WORDS[word]:
             raise ConfigError(f"{word}={value} is unknown; {did_you_mean(value, WORDS[word])}")
@@ -248,7 +269,9 @@ def preset(
     config = PRESETS[name if own else network(name)]
     for change in (MODELS["log_normal" if own else model or "log_normal"], ALGORITHMS[algorithm or "pegasus"]):
         config = change(config)
-    return POLICIES[policy](config) if policy else config
+    if policy:
+        config = POLICIES[policy](config)
+    return EFFORTS[effort or "laptop"](config)
 
 
 def network(name: str) -> str:

@@ -36,17 +36,18 @@ def preset(
     model: str | None = None,
     policy: str | None = None,
     algorithm: str | None = None,
+    effort: str | None = None,
     settings: Mapping[str, Any] | None = None,
 ) -> Config:
     """The config of a command with these words: preset("cartpole") is that of `pegasus-train task=cartpole`.
 
-    `model`, `policy` and `algorithm` are the command's words. `settings` are its other ones, by name, each with its
-    text or its value: {"search.steps": 200, "explore.kind": "walk"}. Raises ConfigError as the command would, in one
-    line with the nearest choice.
+    `model`, `policy`, `algorithm` and `effort` are the command's words. `settings` are its other ones, by name, each
+    with its text or its value: {"search.steps": 200, "explore.kind": "walk"}. Raises ConfigError as the command would,
+    in one line with the nearest choice.
     """
     from pegasus_jax.runs import config_io
 
-    said = {"preset": name, "model": model, "policy": policy, "algorithm": algorithm}
+    said = {"preset": name, "model": model, "policy": policy, "algorithm": algorithm, "effort": effort}
     return config_io.parse({word: value for word, value in said.items() if value is not None} | dict(settings or {}))
 
 

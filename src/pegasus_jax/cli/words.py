@@ -11,7 +11,7 @@ from pegasus_jax import config as limits
 from pegasus_jax.config import KINDS, TASKS, Config
 from pegasus_jax.config_models import ACTIVATIONS, DROPOUTS, INITIALIZERS
 from pegasus_jax.config_plant import EXPLORATIONS, VELOCITIES
-from pegasus_jax.presets import ALGORITHMS, MODELS, NETWORKS, POLICIES, PRESETS
+from pegasus_jax.presets import ALGORITHMS, EFFORTS, MODELS, NETWORKS, POLICIES, PRESETS
 
 # Words of pegasus-train that are no settings: as help shows them, and what they are for.
 OPTIONS = {
@@ -57,6 +57,11 @@ NAMED = {
     ),
     "policy": ("policy=NAME", f"controller: {', '.join(POLICIES)}"),
     "algorithm": ("algorithm=pegasus", f"how to search: {', '.join(ALGORITHMS)}"),
+    "effort": (
+        "effort=laptop",
+        "how much a trial may compute: laptop; workstation, twice the search's iterations; gpu, four policies side by"
+        " side",
+    ),
 }
 
 # What a first user needs.
@@ -66,7 +71,7 @@ FIRST = (
 )
 # Who asks for a word: the first group that has it.
 GROUPS: dict[str, tuple[str, ...]] = {
-    "everybody": ("task", "preset", "out", "resume", "trials", "seed", "final", "eval_episodes", "track"),
+    "everybody": ("task", "preset", "effort", "out", "resume", "trials", "seed", "final", "eval_episodes", "track"),
     "who has a robot, or an environment of Gymnasium": (
         *(
             "env",
@@ -96,6 +101,7 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "model": tuple(MODELS),
     "policy": tuple(POLICIES),
     "algorithm": tuple(ALGORITHMS),
+    "effort": tuple(EFFORTS),
     "track": ("tensorboard", "wandb", "mlflow", "none"),
     "legs": limits.LEGS,
     "successor": limits.SUCCESSORS,
