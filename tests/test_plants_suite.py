@@ -7,11 +7,12 @@ from typing import Any
 import gymnasium
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import pegasus_envs  # noqa: F401 (registers the cart-pole)
-from benchmarks.plants_suite import batched
+from benchmarks.plants_suite import batched, native, picture
 from benchmarks.plants_suite.__main__ import main, share, table
 from benchmarks.plants_suite.native import returns
 from benchmarks.plants_suite.plants import PLANTS
@@ -141,6 +142,57 @@ def test_shares_count_the_newest_policy_of_each_seed() -> None:
     runs = [run(-900, -100), run(-100, -900), run(-100), run()]
     assert [share(runs, -200, until) for until in (1, 2, 4)] == [0, 0.5, 0.5]
     assert "Pendulum-v1" in table(runs)
+
+
+def test_a_pictures_shares_are_those_of_the_table() -> None:
+    def run(*native: float, until: int = 9) -> dict[str, Any]:
+        rows = [{"native": value, "plant_seconds": 2.0 * trial} for trial, value in enumerate(native, start=1)]
+        return {"plant": "Pendulum-v1", "trials": rows[:until]}
+
+    runs = [run(-900, -100, -900), run(-100, -900), run(-100, -100, -100), run(-900, -900, -100, until=1)]
+    times, newest, ever = picture.shares(runs, -200)
+    assert [*times] == [2, 4, 6]
+    assert [*newest] == [share(runs, -200, until) for until in times] == [0.5, 0.5, 0.25]
+    assert [*ever] == [0.5, 0.75, 0.75]
+
+
+def test_a_picture_has_a_panel_for_each_plant_and_refuses_other_files(tmp_path: Path) -> None:
+    file, other = tmp_path / "suite.json", tmp_path / "other.json"
+    rows = [{"native": -100.0, "plant_seconds": 2.0}]
+    runs = [{"plant": name, "trials": rows} for name in ("Pendulum-v1", "Car", "Quadrotor", "CartPole", "Reacher-v5")]
+    file.write_text(json.dumps({"runs": runs}))
+    other.write_text("[]")
+    picture.main([str(file), f"out={tmp_path / 'suite.png'}"])
+    height, width, _ = plt.imread(tmp_path / "suite.png").shape
+    assert height / width == pytest.approx(2 * 2.2 / (4 * 2.8), abs=0.01)  # two rows
+    with pytest.raises(ConfigError, match=r"other.json is not what python -m benchmarks.plants_suite writes"):
+        picture.main([str(other)])
+    with pytest.raises(ConfigError, match="format= is not a word of this"):
+        picture.main(["format=svg"])
+
+
+def test_a_policy_that_was_kept_is_judged_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its row is that of the trial before; a policy that replaced it is judged, and so is the first of all."""
+    rows = [
+        {"trial": trial, "plant_seconds": 2.0 * trial, "policy": 0, "episode_cost": 0.5, "objective_fresh": 0.5}
+        | {"replaced": replaced}
+        for trial, replaced in enumerate([None, True, False, False, True], start=1)
+    ]
+    asked = []
+
+    def of_trial(run: Path, trial: int) -> Any:
+        asked.append(trial)
+        return lambda x: np.full(1, trial / 10)
+
+    monkeypatch.setattr(native.config_io, "load", lambda path: config_io.parse({"task": "gym", "env": "Pendulum-v1"}))
+    monkeypatch.setattr(native.store, "trials", lambda run: rows)
+    monkeypatch.setattr(native.checkpoint, "available", lambda run: [1, 2, 3, 4, 5])
+    monkeypatch.setattr(native, "controller", of_trial)
+    found = [row["returns"] for row in native.scores(tmp_path, "Pendulum-v1", 10)]
+    assert asked == [1, 2, 5]
+    assert found[1] == found[2] == found[3]
+    assert len({tuple(returns) for returns in found}) == 3
+    assert len(found[0]) == 10
 
 
 def test_a_plant_that_is_not_there_is_one_line() -> None:

@@ -1,12 +1,13 @@
 """How many seeds learn plants that nobody here wrote, with the preset that the documents name, after how much time.
 
     python -m benchmarks.plants_suite [plants=[Pendulum-v1,...]] [seeds=100-109] [jobs=2] [out=FILE] [minutes=60]
-        [setting=value ...]
+        [episodes=50] [setting=value ...]
 
 Runs `pegasus-train` once for each plant and seed, `jobs` at a time with one core each, then judges the policy after
-every trial by the environment's own reward (native.py). Writes one JSON, again after each run, and prints one table.
-The runs are in OUT without .json: the same command goes on with those that were stopped, by hand or after `minutes`.
-Tuning seeds are 100 to 119; 200 and above are for a final judgment only. Other settings are for all plants alike.
+every trial by the environment's own reward over at most `episodes` (native.py). Writes one JSON, again after each run,
+and prints one table. The runs are in OUT without .json: the same command goes on with those that were stopped, by hand
+or after `minutes`. Tuning seeds are 100 to 119; 200 and above are for a final judgment only. Other settings are for all
+plants alike. The pendubot and the acrobot need a checkout of their simulator (of_ai_olympics.py).
 """
 
 import json
@@ -22,6 +23,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+from benchmarks.plants_suite.native import MOST
 from benchmarks.plants_suite.plants import PLANTS
 from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.cli.sweep import PROGRAM
@@ -43,13 +45,19 @@ JAX_NOTE = "For simplicity, JAX has removed"  # below the line that says what ha
 SHARES = (0.25, 0.5, 0.75, 1.0)  # of the time by which a plant is to be learned, at which the table looks
 
 
-def one(name: str, seed: int, home: Path, words: Sequence[str], minutes: float, cores: Any) -> dict[str, Any]:
-    """One run, learned or gone on with, and what its policies are worth; `error` is the last line of a failure."""
+def one(
+    name: str, seed: int, home: Path, words: Sequence[str], limits: tuple[float, int], cores: Any
+) -> dict[str, Any]:
+    """One run, learned or gone on with, and what its policies are worth; `error` is the last line of a failure.
+
+    `limits` are the minutes that learning may take, and the episodes that judge a policy at most.
+    """
     plant, run, core, began = PLANTS[name], (home / f"{name}-{seed}").absolute(), cores.get(), time.monotonic()
     new = [f"env={plant.env}", *plant.words, f"seed={seed}", f"trials={plant.trials}", "eval_episodes=0", f"out={run}"]
     task = [f"resume={run}"] if (run / "config.yaml").exists() else ["task=gym", *new, *words]
-    learned = on_core([*PROGRAM, *task], core, 60 * minutes)
-    judged = on_core([sys.executable, "-m", "benchmarks.plants_suite.native", str(run), plant.env], core, None)
+    learned = on_core([*PROGRAM, *task], core, 60 * limits[0])
+    judge = [sys.executable, "-m", "benchmarks.plants_suite.native", str(run), plant.env, str(limits[1])]
+    judged = on_core(judge, core, None)
     cores.put(core)
     rows = json.loads(judged[0].splitlines()[-1]) if judged[1] is None else []
     seconds, error = round(time.monotonic() - began, 1), learned[1] or judged[1]
@@ -101,19 +109,20 @@ def table(runs: Sequence[dict[str, Any]]) -> str:
 
 def main(given: list[str]) -> None:
     """The command line of this module. Raises ConfigError for plants and seeds that are not for this."""
-    options, rest = config_io.split(given, ("plants", "seeds", "jobs", "out", "minutes"))
+    options, rest = config_io.split(given, ("plants", "seeds", "jobs", "out", "minutes", "episodes"))
     names = options["plants"].strip("[]").split(",") if "plants" in options else [*PLANTS]
     seeds = seed_list(options.get("seeds", "100-109").strip("[]"))
     if wrong := [name for name in names if name not in PLANTS]:
         raise ConfigError(f"plants={wrong[0]} is unknown; {did_you_mean(wrong[0], PLANTS)}")
     out = Path(options.get("out", "runs/plants_suite.json")).absolute()
-    jobs, minutes = int(options.get("jobs", "2")), float(options.get("minutes", "60"))
+    jobs = int(options.get("jobs", "2"))
+    limits = float(options.get("minutes", "60")), int(options.get("episodes", MOST))
     cores = core_queue(jobs)
     told = about(shlex.join(["python", "-m", "benchmarks.plants_suite", *given]))
     (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
     words, runs = [f"{key}={value}" for key, value in rest.items()], list[dict[str, Any]]()
     with ThreadPoolExecutor(jobs) as pool:
-        jobs_of = [pool.submit(one, name, seed, home, words, minutes, cores) for seed in seeds for name in names]
+        jobs_of = [pool.submit(one, name, seed, home, words, limits, cores) for seed in seeds for name in names]
         for job in as_completed(jobs_of):
             runs.append(job.result())
             write_json(out, {"runs": runs, "about": told})

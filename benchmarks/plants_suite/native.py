@@ -1,8 +1,9 @@
 """The native return of each policy of a run: the environment's own reward, time limit, starts and end.
 
-    python -m benchmarks.plants_suite.native RUN ENV
+    python -m benchmarks.plants_suite.native RUN ENV [EPISODES]
 
-prints one JSON row for each trial: the returns and the lengths of 10 to 50 episodes, whose resets have fixed seeds. The
+prints one JSON row for each trial: the returns and the lengths of 10 to 50 episodes, or at most so many, whose resets
+have fixed seeds. The
 best return may depend on the start: that of dm_control's pendulum is 790 from ten of its starts, 846 from all of them.
 """
 
@@ -18,9 +19,10 @@ from pegasus_jax import controller
 from pegasus_jax.runs import checkpoint, config_io, store
 
 FIRST_RESET, STEPS = 10_000, 10_000  # STEPS: after which there are enough episodes
+MOST = 50
 
 
-def returns(control: Any, env: Any, least: int = 10, most: int = 50) -> tuple[list[float], list[int]]:
+def returns(control: Any, env: Any, least: int = 10, most: int = MOST) -> tuple[list[float], list[int]]:
     """The return and the length of each episode of `control`, observation -> control."""
     totals, lengths = list[float](), list[int]()
     while len(totals) < least or (len(totals) < most and sum(lengths) < STEPS):
@@ -34,19 +36,20 @@ def returns(control: Any, env: Any, least: int = 10, most: int = 50) -> tuple[li
     return totals, lengths
 
 
-def scores(run: Path, name: str) -> list[dict[str, Any]]:
+def scores(run: Path, name: str, most: int = MOST) -> list[dict[str, Any]]:
     """One row for each trial that has a policy and a row of its own."""
     env, rows = gymnasium.make(name), []
     seen = list(config_io.load(run / "config.yaml").sensors.measured) or slice(None)
     for row in store.trials(run):
         if row["trial"] not in checkpoint.available(run):
             continue
-        control = controller(run, trial=row["trial"])
-        totals, lengths = returns(lambda x, control=control: control(x[seen]), env)
+        if not rows or row["replaced"] is not False:  # else it is the policy of before
+            control = controller(run, trial=row["trial"])
+            totals, lengths = returns(lambda x, control=control: control(x[seen]), env, most=most)
         told = {key: row[key] for key in ("trial", "plant_seconds", "policy", "episode_cost", "objective_fresh")}
         rows.append(told | {"native": round(float(np.mean(totals)), 3), "returns": totals, "lengths": lengths})
     return rows
 
 
 if __name__ == "__main__":
-    print(json.dumps(scores(Path(sys.argv[1]), sys.argv[2])))
+    print(json.dumps(scores(Path(sys.argv[1]), sys.argv[2], *map(int, sys.argv[3:]))))
