@@ -58,3 +58,11 @@ def cartpole(x: Array) -> Array:
 def dm_cartpole(x: Array) -> Array:
     """[cart, angle, speed, rate], upright at 0: the tip of a pole of 1 m over the middle of the rail."""
     return saturating((x[0] + jnp.sin(x[1])) / 0.4, (jnp.cos(x[1]) - 1) / 0.4)
+
+
+def two_links(x: Array) -> Array:
+    """[2 angles, rates], 0 hanging, links of .2 and .3 m: the tip above the shoulder, and slow."""
+    first, second = x[0], x[0] + x[1]
+    beside = 0.2 * jnp.sin(first) + 0.3 * jnp.sin(second)
+    height = -0.2 * jnp.cos(first) - 0.3 * jnp.cos(second)
+    return saturating(beside / 0.2, (height - 0.5) / 0.2, x[2] / 20, x[3] / 20)

@@ -26,7 +26,7 @@ from pegasus_jax.runs.files import write_whole
 
 USUAL = (
     *("pendulum", "inverted_pendulum", "double_pendulum", "reacher", "dm_cartpole", "dm_pendulum", "cartpole"),
-    *("by_hand",),
+    *("pendubot", "by_hand"),
 )
 COLUMNS = 4
 Run = Mapping[str, Any]

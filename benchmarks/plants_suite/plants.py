@@ -24,6 +24,7 @@ class Plant(NamedTuple):
 
 
 HAND = "benchmarks.plants_suite.by_hand:"
+AIO = "benchmarks.plants_suite.of_ai_olympics:ai_olympics/"
 DM = "benchmarks.plants_suite.of_dm_control:dm_control/"
 IP, IDP = "InvertedPendulum-v5", "InvertedDoublePendulum-v5"
 PLANTS: dict[str, Plant] = {
@@ -51,6 +52,9 @@ PLANTS: dict[str, Plant] = {
     "CartPole": Plant(
         "pegasus_envs:pegasus/CartPoleSwingUp-v0", task(25, "cartpole", angles="[3]", rates="[1,2]"), 15, -12.5, 20.0
     ),
+    # The most is 250, for who has been above the line for all of the 10 s.
+    "pendubot": Plant(f"{AIO}Pendubot-v0", task(50, "two_links", angles="[0,1]", rates="[2,3]"), 30, 125.0, 60.0),
+    "acrobot": Plant(f"{AIO}Acrobot-v0", task(50, "two_links", angles="[0,1]", rates="[2,3]"), 45, 125.0, 90.0),
     # Held back. The most is 200, one for each period.
     "Quadrotor": Plant(
         f"{HAND}Quadrotor-v0", task(40, "quadrotor", angles="[2]", module="by_hand", rates="[3,4,5]"), 6, 180.0, 12.0
