@@ -88,6 +88,7 @@ def test_an_effort_is_a_number_of_iterations_or_of_policies_whatever_the_plant()
         assert preset(task, effort="laptop").search == usual
         assert preset(task, effort="workstation").search == dataclasses.replace(usual, steps=2 * usual.steps)
         assert preset(task, effort="gpu").search == dataclasses.replace(usual, num_starts=4)
+    assert preset("double_cartpole_gpu", effort="gpu") == preset("double_cartpole_gpu")  # it has more
     of_gaussians = dict(model="gp", policy="rbf", algorithm="pilco")
     assert preset("cartpole", **of_gaussians, effort="workstation").search.steps == 600
 

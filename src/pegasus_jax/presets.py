@@ -233,10 +233,10 @@ def _four_policies(config: Config) -> Config:
         raise ConfigError(
             "effort=gpu is policies side by side, of which this search has one; the nearest is effort=laptop"
         )
-    return replace(config, search=replace(config.search, num_starts=4))
+    return replace(config, search=replace(config.search, num_starts=max(4, config.search.num_starts)))
 
 
-# How much computing a trial is worth: docs/decisions.md 0042.
+# How much computing a trial is worth: docs/decisions.md 0012.
 EFFORTS: dict[str, Change] = {
     "laptop": lambda config: config,
     "workstation": lambda config: replace(config, search=replace(config.search, steps=2 * config.search.steps)),
