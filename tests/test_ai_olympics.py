@@ -14,6 +14,7 @@ import pytest
 
 from benchmarks.plants_suite.costs import two_links
 
+NAME = "benchmarks.plants_suite.of_ai_olympics"
 PACKAGE = {
     "__init__": "",
     "model/__init__": "",
@@ -48,25 +49,30 @@ class Simulator:
 }
 
 
+def imported() -> list[str]:
+    """The modules of this that are there: ours, and those of a checkout or its stand-in."""
+    return [one for one in sys.modules if one == NAME or one.partition(".")[0] == "double_pendulum"]
+
+
 @pytest.fixture
 def olympics(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
     """of_ai_olympics.py with the stand-in for a checkout."""
-    root, name = tmp_path / "src/python/double_pendulum", "benchmarks.plants_suite.of_ai_olympics"
+    root = tmp_path / "src/python/double_pendulum"
     for module, text in PACKAGE.items():
         file = root / f"{module}.py"
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_text(text)
     monkeypatch.syspath_prepend(root.parent)
-    for module in [one for one in sys.modules if one == name or one.partition(".")[0] == "double_pendulum"]:
+    for module in imported():
         monkeypatch.delitem(sys.modules, module)
-    found = importlib.import_module(name)
+    found = importlib.import_module(NAME)
     parameters = tmp_path / found.PARAMETERS
     parameters.parent.mkdir(parents=True)
     parameters.write_text("0.2 0.3")
     yield found
     for environment in [one for one in gymnasium.registry if one.startswith("ai_olympics/")]:
         gymnasium.registry.pop(environment)
-    for module in [one for one in sys.modules if one == name or one.partition(".")[0] == "double_pendulum"]:
+    for module in imported():
         del sys.modules[module]
 
 

@@ -46,17 +46,14 @@ SHARES = (0.25, 0.5, 0.75, 1.0)  # of the time by which a plant is to be learned
 
 
 def one(
-    name: str, seed: int, home: Path, words: Sequence[str], limits: tuple[float, int], cores: Any
+    name: str, seed: int, home: Path, words: Sequence[str], minutes: float, episodes: int, cores: Any
 ) -> dict[str, Any]:
-    """One run, learned or gone on with, and what its policies are worth; `error` is the last line of a failure.
-
-    `limits` are the minutes that learning may take, and the episodes that judge a policy at most.
-    """
+    """One run, learned or gone on with, and what its policies are worth; `error` is the last line of a failure."""
     plant, run, core, began = PLANTS[name], (home / f"{name}-{seed}").absolute(), cores.get(), time.monotonic()
     new = [f"env={plant.env}", *plant.words, f"seed={seed}", f"trials={plant.trials}", "eval_episodes=0", f"out={run}"]
     task = [f"resume={run}"] if (run / "config.yaml").exists() else ["task=gym", *new, *words]
-    learned = on_core([*PROGRAM, *task], core, 60 * limits[0])
-    judge = [sys.executable, "-m", "benchmarks.plants_suite.native", str(run), plant.env, str(limits[1])]
+    learned = on_core([*PROGRAM, *task], core, 60 * minutes)
+    judge = [sys.executable, "-m", "benchmarks.plants_suite.native", str(run), plant.env, str(episodes)]
     judged = on_core(judge, core, None)
     cores.put(core)
     rows = json.loads(judged[0].splitlines()[-1]) if judged[1] is None else []
@@ -115,14 +112,15 @@ def main(given: list[str]) -> None:
     if wrong := [name for name in names if name not in PLANTS]:
         raise ConfigError(f"plants={wrong[0]} is unknown; {did_you_mean(wrong[0], PLANTS)}")
     out = Path(options.get("out", "runs/plants_suite.json")).absolute()
-    jobs = int(options.get("jobs", "2"))
-    limits = float(options.get("minutes", "60")), int(options.get("episodes", MOST))
+    jobs, minutes = int(options.get("jobs", "2")), float(options.get("minutes", "60"))
+    episodes = int(options.get("episodes", MOST))
     cores = core_queue(jobs)
     told = about(shlex.join(["python", "-m", "benchmarks.plants_suite", *given]))
     (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
     words, runs = [f"{key}={value}" for key, value in rest.items()], list[dict[str, Any]]()
     with ThreadPoolExecutor(jobs) as pool:
-        jobs_of = [pool.submit(one, name, seed, home, words, limits, cores) for seed in seeds for name in names]
+        same = (home, words, minutes, episodes, cores)
+        jobs_of = [pool.submit(one, name, seed, *same) for seed in seeds for name in names]
         for job in as_completed(jobs_of):
             runs.append(job.result())
             write_json(out, {"runs": runs, "about": told})

@@ -2,9 +2,9 @@
 
     python -m benchmarks.plants_suite.native RUN ENV [EPISODES]
 
-prints one JSON row for each trial: the returns and the lengths of 10 to 50 episodes, or at most so many, whose resets
-have fixed seeds. The
-best return may depend on the start: that of dm_control's pendulum is 790 from ten of its starts, 846 from all of them.
+prints one JSON row for each trial: the returns and the lengths of 10 to EPISODES episodes (50), whose resets have fixed
+seeds. The best return may depend on the start: that of dm_control's pendulum is 790 from ten of its starts, 846 from
+all of them.
 """
 
 import json

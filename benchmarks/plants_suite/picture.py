@@ -7,7 +7,7 @@ FILE is what `python -m benchmarks.plants_suite` wrote; without one, the stored 
 
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +19,25 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from benchmarks import RESULTS
+from benchmarks.plants_suite.__main__ import share
 from benchmarks.plants_suite.plants import PLANTS
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.files import write_whole
 
-USUAL = (
-    *("pendulum", "inverted_pendulum", "double_pendulum", "reacher", "dm_cartpole", "dm_pendulum", "cartpole"),
-    *("pendubot", "by_hand"),
-)
+USUAL = [
+    "pendulum",
+    "inverted_pendulum",
+    "double_pendulum",
+    "reacher",
+    "dm_cartpole",
+    "dm_pendulum",
+    "cartpole",
+    "pendubot",
+    "by_hand",
+]
 COLUMNS = 4
-Run = Mapping[str, Any]
+Run = dict[str, Any]
 
 
 def shares(runs: Sequence[Run], bar: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -38,13 +46,9 @@ def shares(runs: Sequence[Run], bar: float) -> tuple[np.ndarray, np.ndarray, np.
     A run that was stopped keeps its last policy.
     """
     times = np.unique([row["plant_seconds"] for run in runs for row in run["trials"]])
-    newest, ever = np.zeros((2, len(runs), len(times)), bool)
-    for index, run in enumerate(runs):
-        for row in run["trials"]:
-            later = times >= row["plant_seconds"]
-            newest[index, later] = row["native"] >= bar
-            ever[index, later] |= row["native"] >= bar
-    return times, newest.mean(0), ever.mean(0)
+    reached = [[row["plant_seconds"] for row in run["trials"] if row["native"] >= bar] for run in runs]
+    first = np.array([min(seconds, default=np.inf) for seconds in reached])
+    return times, np.array([share(runs, bar, until) for until in times]), np.mean(first[:, None] <= times, 0)
 
 
 def draw(runs: Sequence[Run], path: Path) -> None:
