@@ -104,15 +104,6 @@ def test_a_policy_counts_in_the_units_it_is_given():
         config.MLP(input_units=(1.0, 0.0, 1.0))
 
 
-def test_a_policy_that_finds_its_units_begins_near_the_middle_of_its_controls():
-    """decision 0040"""
-    task = tasks.make("cartpole")
-    policies = (policy_of(config.MLP(hidden=(5,), input_units=units), task) for units in ((), None))
-    plain, found = (policy.init(jax.random.key(0)) for policy in policies)
-    outgoing = lambda params: params["network"]["params"]["layer_1"]["kernel"]  # noqa: E731
-    np.testing.assert_allclose(outgoing(found), 0.3 * outgoing(plain), rtol=1e-6)
-
-
 def test_a_policy_counts_earlier_controls_in_their_own_range():
     """Told in N or in mN, forces of before move a fresh policy alike; what was learned with another input keeps it."""
     words = {"task": "cartpole", "sensors.measured": "[0,3]", "sensors.velocity": "difference", "sensors.delay": "1"}

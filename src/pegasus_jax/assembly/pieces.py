@@ -29,8 +29,7 @@ from pegasus_jax.policies.squash import SQUASHES, to_limits
 from pegasus_jax.task import Task
 from pegasus_jax.types import Dropout, Dynamics, ModelLearner, Policy
 
-# Of the outgoing weights of a fresh network controller: under a constraint, and where units are found in the data.
-AT_REST, GENTLE = 0.05, 0.3
+AT_REST = 0.05  # of the outgoing weights of a fresh network controller under a constraint
 
 NOISES: dict[str, Callable[[settings.BNN | settings.Lagrangian], Dropout]] = {
     "log_normal": lambda config: dropout.log_normal(config.log_z_min),
@@ -135,7 +134,6 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
         case settings.Linear():
             return linear(**shared, features=features, saturate_moments=saturate_moments)
         case settings.MLP():
-            found = config.input_units is None
             return mlp(
                 **shared,
                 features=features,
@@ -144,7 +142,7 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
                 initializer=config.initializer,
                 input_scale=tasks.input_scale(task, config.input_units),
                 units=tasks.control_units(task),
-                find_units=found,
+                find_units=config.input_units is None,
                 # Within a constraint a policy grows from one that hardly moves, and need not find its way back.
-                output_scale=AT_REST if task.constraint is not None else GENTLE if found else 1.0,
+                output_scale=1.0 if task.constraint is None else AT_REST,
             )
