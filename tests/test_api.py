@@ -8,6 +8,7 @@ import sys
 import tempfile
 import typing
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import partial
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -483,6 +484,13 @@ PIECES_THAT_ARE_WRONG = [
     ),
     ("cost", pg.costs.of_particles(pg.Cost(lambda x: x)), r"the cost of one state has shape \(2,\); expected \(\)"),
     (
+        "dynamics",
+        DYNAMICS._replace(apply=lambda *_: (jnp.zeros(D), jnp.ones(D))),
+        r"dynamics\.apply returns a tuple; expected Prediction\(mean \[D\], std \[D\]\)",
+    ),
+    ("cost", TASK.cost.of_state, r"cost\(x\) of states \(4, 5, 2\) has shape \(\); expected \[H, K\] \(4, 5\): costs"),
+    ("cost", lambda x: x[0], r"cost\(x\) .* has shape \(5, 2\); expected \[H, K\] \(4, 5\)"),
+    (
         "cost",
         pg.costs.of_particles(pg.Cost(lambda x: x[0] > 1)),
         r"the cost of one state is of bool; expected floating-point",
@@ -517,6 +525,93 @@ def test_a_policy_that_answers_wrongly_is_named_before_the_plant_moves() -> None
     state = experiment.init(key())
     with pytest.raises(ValueError, match=r"what policy\.apply returns has shape \(2,\); expected \[U\] \(1,\)"):
         jax.eval_shape(experiment.collect, state)
+
+
+def test_the_cost_of_a_task_is_one_of_an_objective() -> None:
+    given = imagined()
+    assert J(*given) == J(*given, cost=TASK.cost)
+
+
+WRONG_TASKS = [
+    (dict(control_low=-2.0), r"the task's control_low has shape \(\); expected \(1,\), of 1 controls"),
+    (dict(state_names=("a", "b", "c")), r"the task's start_mean has shape \(2,\); expected \(3,\), of 3 states"),
+    (dict(sensor_std=None), r"the task's sensor_std has shape \(\); expected \(2,\)"),
+    (dict(angles=(5,)), r"the task's angles=\(5,\) has 5; its 2 states are 0 to 1"),
+    (dict(horizon=10.0), r"the task's horizon=10\.0 is not a whole number"),
+    (
+        dict(control_low=[2.0], control_high=[-2.0]),
+        r"the task's limits of force are 2 and -2; expected control_low first",
+    ),
+]
+
+
+@pytest.mark.parametrize(("fields", "message"), WRONG_TASKS)
+def test_a_task_whose_fields_do_not_agree_is_refused_in_one_line(fields: dict[str, Any], message: str) -> None:
+    with pytest.raises(pg.ConfigError, match=f"^{message}"):
+        pg.compose(CONFIG, TASK._replace(**fields))
+
+
+WRONG_KINDS: list[tuple[dict[str, Any], str]] = [
+    (dict(fitter=optax.adamw(1e-3)), r"fitter=\w+ is no ModelLearner; .*\(init, run\); minibatches"),
+    (dict(policy=lambda params, noise, x: x), r"policy=function is no Policy; .*; of_pair makes one"),
+    (dict(dynamics=DYNAMICS.apply), r"dynamics=\w+ is no Dynamics; expected pegasus_jax\.Dynamics\(init, "),
+    (dict(searcher=pg.gradient_search), r"searcher=function is no PolicyOptimizer; expected"),
+]
+
+
+@pytest.mark.parametrize(("piece", "message"), WRONG_KINDS)
+def test_what_is_no_piece_is_refused_by_its_name(piece: dict[str, Any], message: str) -> None:
+    with pytest.raises(pg.ConfigError, match=f"^{message}"):
+        pg.compose(CONFIG, TASK, **piece)
+
+
+def test_a_task_is_no_config() -> None:
+    with pytest.raises(pg.ConfigError, match=r"build takes a Config, not a Task; compose\(config, task\) takes both"):
+        pg.build(TASK)  # type: ignore[arg-type]
+    with pytest.raises(
+        pg.ConfigError, match=r"train takes a Config or .* preset, not a Task; .*compose\(config, task\)"
+    ):
+        pg.train(TASK)  # type: ignore[arg-type]
+
+
+def test_controls_of_a_policy_of_your_own_are_cut_off_at_the_limits() -> None:
+    wild = POLICY._replace(apply=lambda params, noise, x: 100 * x[:1])
+    experiment = pg.compose(CONFIG, TASK, policy=wild)
+    state = experiment.init(key())
+    flight = experiment.episode(key(), state.policy.params, False)
+    expected = jnp.clip(100 * flight.x[:-1, :1], -2, 2)
+    np.testing.assert_allclose(flight.u, expected)
+    assert float(jnp.max(jnp.abs(flight.u))) == 2
+
+
+def test_a_task_with_a_memory_may_be_composed_again() -> None:
+    config = replace(CONFIG, control_rate=(1.0,))
+    once = pg.compose(config, TASK).task
+    assert pg.compose(config, once).task.memory.names == once.memory.names != ()
+
+
+def test_a_model_without_parameters_is_fitted() -> None:
+    known = DYNAMICS._replace(
+        init=lambda key: (),
+        loss=lambda params, key, batch, context: jnp.zeros(()),
+        posterior=lambda params, data: (),
+        sample=lambda key, posterior: (),
+        apply=lambda posterior, noise, x, u: pg.Prediction(0.3 * jnp.stack([x[1], u[0]]), jnp.ones(2)),
+        deal=None,
+    )
+    experiment = pg.compose(CONFIG, TASK, dynamics=known)
+    state, info = experiment.fit(experiment.add_episode(experiment.init(key()), trajectory()))
+    assert state.model.params == ()
+    assert info.skipped == 0
+
+
+def test_an_objective_that_is_not_finite_changes_no_policy() -> None:
+    """Its gradient may be finite all the same."""
+    experiment = pg.compose(CONFIG, TASK, cost=lambda x: x[0] + jnp.nan)
+    state = experiment.add_episode(experiment.init(key()), trajectory())
+    found, info = jax.jit(experiment.search)(state)
+    assert info.skipped == CONFIG.search.steps
+    jax.tree.map(np.testing.assert_array_equal, found.policy.params, state.policy.params)
 
 
 def test_a_number_is_no_cost() -> None:

@@ -87,6 +87,14 @@ def test_it_says_what_a_robot_is_like_and_moves_nothing(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir() if path.name not in ("robot.py", "__pycache__")] == ["asked.log"]
 
 
+def test_it_says_what_is_taken_for_what_was_left_unsaid(tmp_path: Path) -> None:
+    words = ["env=robot:Arm-v0", "cost=robot:cost", "start_mean=[3.14,0]", "dt=0.1", "eval_episodes=20"]
+    code, said, _ = call("check", *words, cwd=tmp_path)
+    assert code == 0, said
+    for part in ("dt=0.1, and env=robot:Arm-v0 has dt 0.05", "eval_episodes=0 leaves them out"):
+        assert part in said
+
+
 def test_the_cost_where_episodes_start_is_the_average_of_them(tmp_path: Path) -> None:
     """Not the cost of their mean, which is the goal here."""
     wide = ["env=robot:Arm-v0", "cost=robot:cost", "start_mean=[0,0]", "start_std=[1.5]"]
@@ -119,12 +127,12 @@ def test_a_mistake_is_one_line_and_moves_nothing(
 
 
 def test_training_notes_what_checking_does(tmp_path: Path) -> None:
-    words = ["env=robot:Twice-v0", "cost=robot:big", *TINY, "explore.trials=2"]
+    words = ["env=robot:Twice-v0", "cost=robot:big", *TINY, "explore.trials=2", "dt=0.06"]
     code, said, _ = call("train", *words, "out=run", cwd=tmp_path)
     assert code == 0, said
     notes = [line for line in said.splitlines() if line.startswith("note: ")]
-    assert len(notes) == 3, said
-    for part in ("more than 1: success", "x2 follows from cos(x0)", "the same: x3"):
+    assert len(notes) == 4, said
+    for part in ("has dt 0.05", "more than 1: success", "x2 follows from cos(x0)", "the same: x3"):
         assert part in "\n".join(notes)
 
 

@@ -239,7 +239,9 @@ def test_a_name_cannot_end_a_comment() -> None:
 def test_the_command_says_what_it_wrote(runs: dict[str, Path], capsys: pytest.CaptureFixture[str]) -> None:
     run = runs["linear, double"]
     cli.handle([str(run), "trial=last", "overwrite=true"])
-    lines = capsys.readouterr().out.splitlines()
+    said = capsys.readouterr()
+    assert said.err == f"exporting {run}, and comparing the file with its policy on 1,000 observations\n"
+    lines = said.out.splitlines()
     assert lines[0] == f"{run}/controller.py: The controller after trial 2 of linear-double, task cartpole"
     assert lines[1] == "newest policy: trial 2"
     assert lines[2] == f"{run}/controller.py.json: its contract"

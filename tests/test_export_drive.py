@@ -25,7 +25,7 @@ from pegasus_jax.report.read import look
 from pegasus_jax.runs import config_io, store
 
 ROBOT = """
-import os, signal, time
+import os, signal, sys, time
 import gymnasium, jax.numpy as jnp, numpy as np
 
 def note(what):
@@ -39,6 +39,7 @@ class Arm(gymnasium.Env):
 
     def reset(self, *, seed=None, options=None):
         note("reset")
+        print("it is reset", file=sys.stderr, flush=True)
         if os.environ.get("BREAKS") == "reset":
             raise OSError("the motor driver does not answer")
         self.x = np.array([3.0, 0.0])
@@ -126,7 +127,11 @@ def test_a_robot_is_driven_by_the_policy_at_its_period(home: Path) -> None:
     done = driven(home, "episodes=2", "seconds=0.3", "trial=1")
     assert (done.code, done.asked) == (0, ["reset", "reset", "close"]), done.err
     said = "the policy of trial 1 drives driven_robot:Driven-v0: x0, x1 -> u0 from -2 to 2; every 0.02 s for 0.3 s"
-    assert f"{said}, watchdog 0.5 s" in done.err.splitlines()
+    before_motion = [*done.err.splitlines()]
+    assert before_motion[-5:] == [
+        "preparing the controller of trial 1; nothing moves yet",
+        *[f"{said}, watchdog 0.5 s", "it is reset"] * 2,
+    ]
     lines = done.out.splitlines()
     assert len(lines) == 2
     assert lines[1].startswith("run/driven/0002.npz: 15 controls, mean cost 1.000, ended by horizon; ")
@@ -238,7 +243,7 @@ def test_what_cannot_be_is_refused(home: Path, tmp_path: Path, monkeypatch: pyte
     for words, complaint in (
         (["seconds=soon"], "seconds=soon is not a number of seconds; for example seconds=2.5"),
         (["seconds=0"], "seconds=0 is out of range"),
-        (["episodes=0"], "episodes=0 is not a whole number"),
+        (["episodes=0"], "episodes=0 is out of range; expected a number in [1, 10000]"),
         (["watchdgo=1"], "did you mean 'watchdog'"),
     ):
         with pytest.raises(ConfigError, match=complaint):

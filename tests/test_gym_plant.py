@@ -14,11 +14,15 @@ import jax
 import numpy as np
 import pytest
 
-from pegasus_envs.gym_plant import env_plant, env_spec, make_env, period
+from pegasus_envs.gym_plant import close_environments, env_plant, env_spec, make_env, period
 from pegasus_jax import episode, interrupt
 from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.checks import RunError
+from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io, store
+from pegasus_jax.runs.collect import failed
 from pegasus_jax.task import Task
+from pegasus_jax.tasks import assumed
 from pegasus_jax.types import Cost
 from probes import cart, tiny
 
@@ -83,6 +87,9 @@ def task_of(env: str, states: int, horizon: int = 9, low: float = -2.0, high: fl
         environment=env_plant(env, (), states),
         cost=Cost(lambda x: x[0] ** 2, widen=lambda factor: Cost(lambda x: (x[0] / factor) ** 2)),
         state_names=tuple(f"x{i}" for i in range(states)),
+        start_mean=np.zeros(states),
+        start_std=np.ones(states),
+        sensor_std=np.zeros(states),
         control_low=np.array([low]),
         control_high=np.array([high]),
     )
@@ -262,6 +269,10 @@ def test_what_is_no_answer_of_gymnasium_is_said(answer: Any, step: Any, says: st
     ran = episode.drive(0, lambda t, x: np.zeros(1), task_of("Odd-v0", 1))
     assert ran.ended == "error"
     assert says in str(ran.error)
+    when = "the reset" if step is None else "control period 1"
+    with pytest.raises(RunError) as refused:
+        failed(ran, task_of("Odd-v0", 1))
+    assert str(refused.value) == f"Odd-v0 failed in {when} of an episode: {ran.error}"
 
 
 class Odd(Base):
@@ -281,6 +292,55 @@ class Odd(Base):
 )
 def test_the_control_period_is_what_the_environment_says(about: dict, dt: float) -> None:
     assert period(type("Timed", (Base,), about)()) == pytest.approx(dt)
+
+
+@pytest.mark.parametrize(
+    ("about", "dt", "told"),
+    [
+        ({}, None, "env=Period-v0 says no dt; a period of 1 s is assumed"),
+        ({}, 0.1, None),
+        ({"metadata": {"render_fps": 20}}, None, None),
+        ({"dt": 0.05}, None, None),
+        ({"dt": 0.05}, 0.05, None),
+        ({"dt": 0.05}, 0.1, "dt=0.1, and env=Period-v0 has dt 0.05"),
+        ({"dt": "fast"}, 0.1, None),
+    ],
+)
+def test_a_control_period_that_nobody_said_or_two_did_is_noted(about: dict, dt: float | None, told: str | None) -> None:
+    gymnasium.register("Period-v0", type("Period", (Base,), about))
+    close_environments()
+    notes = assumed.notes(Config(task="gym", env="Period-v0", dt=dt, eval_episodes=0))
+    assert [note.startswith(told or "") for note in notes] == [True] * (told is not None), notes
+    close_environments()
+
+
+@pytest.mark.parametrize(("task", "episodes", "count"), [("gym", 20, 1), ("gym", 0, 0), ("cartpole", 20, 0)])
+def test_episodes_that_only_measure_are_noted_where_a_robot_may_run_them(task: str, episodes: int, count: int) -> None:
+    gymnasium.register("Measured-v0", Base)
+    notes = assumed.notes(Config(task=task, env="Measured-v0", dt=0.1, eval_episodes=episodes))
+    assert len(notes) == count
+    assert all("20 more episodes" in note and "eval_episodes=0 leaves them out" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("observed", "says"),
+    [
+        (gymnasium.spaces.Dict({"a": gymnasium.spaces.Box(-1, 1, (2,)), "b": gymnasium.spaces.Box(-1, 1)}), 3),
+        (gymnasium.spaces.Box(-1, 1, (2, 3)), 6),
+        (gymnasium.spaces.Sequence(gymnasium.spaces.Discrete(2)), None),
+    ],
+)
+def test_an_observation_that_is_no_vector_is_refused_with_a_way_out(observed: Any, says: int | None) -> None:
+    made = type("Shaped", (Base,), {"observation_space": observed, "reset": lambda self, **_: (observed.sample(), {})})
+    gymnasium.register("Shaped-v0", made)
+    close_environments()
+    with pytest.raises(ValueError, match="not a Box of one dimension; ") as error:
+        env_spec("Shaped-v0")
+    assert ("FlattenObservation(env)" in str(error.value)) == (says is not None)
+    if says:
+        gymnasium.register("Flat-v0", lambda: gymnasium.wrappers.FlattenObservation(made()))
+        assert env_spec("Flat-v0").start_mean.shape == (says,)
+    close_environments()
 
 
 @pytest.mark.parametrize("dt", [lambda self: 0.05, "fast", 0.0, True])
@@ -308,7 +368,10 @@ def test_what_did_not_take_place_costs_what_the_user_says() -> None:
         ([], "task=gym needs env= and cost="),
         (["env=Pendulum-v1"], "task=gym needs env= and cost="),
         (["env=Pendulumm-v1", "cost=costs:upright"], "Pendulum"),
-        (["env=CartPole-v1", "cost=costs:upright"], "its action_space is Discrete(2), not a Box"),
+        (
+            ["env=CartPole-v1", "cost=costs:upright"],
+            "Discrete(2), not a Box of one dimension; controls must be numbers in",
+        ),
         (["env=Pendulum-v1", "cost=costs:down"], "cost=costs:down cannot be imported"),
         (["env=Pendulum-v1", "cost=nowhere:down"], "no module named 'nowhere' in"),
         (["env=Pendulum-v1", "cost=costs"], "expected cost=module:function"),

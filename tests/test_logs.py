@@ -10,7 +10,9 @@ import pytest
 import pegasus_jax as pg
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.learn import data as dataset
+from pegasus_jax.logs.columns import layout
 from pegasus_jax.logs.read import read
+from pegasus_jax.logs.table import Names, Table
 from pegasus_jax.math import circles
 from pegasus_jax.runs import config_io, logged, store
 from pegasus_jax.types import Cost, RunState
@@ -50,6 +52,7 @@ TIMED = np.column_stack([0.3 * np.arange(5), ROWS])
     [
         ("x [m],v [m/s],u", ROWS, ()),
         ("u,gyro,v,x", np.column_stack([ROWS[:, 2], ROWS[:, 0], ROWS[:, 1], ROWS[:, 0]]), ()),  # by their names
+        ("V [m/s],U,X [m]", ROWS[:, [1, 2, 0]], ()),  # by names in other letters
         ("t,pos,speed,force", TIMED, ()),  # by their order
         ("stamp,pos,speed,force", TIMED, ("t=stamp", "pos", "speed", "force")),
         ("ms,cm,u,speed", TIMED[:, [0, 1, 3, 2]] * [1e3, 100, 1, 1], ("t=ms*0.001", "x=cm*0.01", "speed", "u")),
@@ -60,6 +63,32 @@ def test_columns_are_found_by_map_by_name_or_by_order(header, rows, columns, tmp
     same(found)
     assert ("by their order, pos, speed, force are x, v, u" in " ".join(notes)) == (header == "t,pos,speed,force")
     assert ("no column t" in " ".join(notes)) == (rows.shape[1] == 3 or "gyro" in header)
+
+
+@pytest.mark.parametrize(
+    ("columns", "found", "time"),
+    [
+        ("Time,Position,Pitch_Rate,Torque", "Position,Pitch_Rate,Torque", "Time"),
+        ("T,Pitch Rate [rad/s],POSITION,t_orque,torque", "POSITION,Pitch Rate [rad/s],torque", "T"),
+        ("position,pitch rate,torque,T", "position,pitch rate,torque", None),  # a temperature, as likely
+        ("time,Time,position,Position,pitch rate,torque", "position,pitch rate,torque", "time"),
+    ],
+)
+def test_names_match_whatever_their_letters_are(columns, found, time):
+    every = tuple(columns.split(","))
+    table = Table("a.csv", every, np.zeros((3, len(every))), np.arange(3))
+    known, note = layout(table, Names(("position", "pitch rate"), ("torque",), (False, False), 0.1), ())
+    assert [column.name for column in (*known.observation, *known.control)] == found.split(",")
+    assert (known.time and known.time.name, note) == (time, "")
+
+
+def test_a_column_that_is_one_names_own_is_no_other_names():
+    names, rows = Names(("t", "T"), ("x",), (False, False), 0.1), np.zeros((3, 3))
+    known, _ = layout(Table("a.csv", ("T", "X", "t"), rows, np.arange(3)), names, ())
+    assert [column.name for column in (*known.observation, *known.control)] == ["t", "T", "X"]
+    twice = Table("a.csv", ("T", "X", "x ", "t", "X [m]"), np.zeros((3, 5)), np.arange(3))
+    with pytest.raises(ConfigError, match="no column x"):
+        layout(twice, names, ())
 
 
 def test_a_file_without_header_is_read_in_order(tmp_path):

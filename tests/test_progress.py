@@ -64,6 +64,16 @@ def test_a_trial_in_one_line() -> None:
         ),
         ({"replaced": False}, "policy kept: cost 0.310", "policy now"),
         ({"skipped_updates": 3}, "3 updates skipped", "None"),
+        (
+            {"seconds": {"compile": 5.0, "between_episodes": 1.5}},
+            "(1.5 s until the next episode, 1.5 s of them compiling)",
+            "5.0",
+        ),
+        (
+            {"policy": 0, "random": True, "objective_fresh": None},
+            "first policy, before any search: cost 0.310, success 85%",
+            "policy now",
+        ),
     ],
 )
 def test_a_line_says_what_was_executed_and_what_is_known(changes: dict[str, Any], says: str, does_not_say: str) -> None:
@@ -182,6 +192,20 @@ def test_a_log_has_a_line_a_phase_and_is_never_silent_for_long(monkeypatch: pyte
     assert text.getvalue() == before
 
 
+def test_a_stage_that_waits_for_the_compiler_has_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(progress, "BRIEF", 0.1)
+    text = io.StringIO()
+    with Display(2, Console(file=text, width=200)).running() as display:
+        display.phase(1, "collect")
+        for part in ("episode", "add_episode"):
+            time.sleep(0.4)
+            with display.compiling(part):
+                time.sleep(0.4)
+        time.sleep(0.4)
+    told = ["trial 1/2  running its episode", "compiling the episode (once)", "compiling the data set (once)"]
+    assert text.getvalue().splitlines() == told
+
+
 def test_quiet_is_quiet(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setattr(progress, "BRIEF", 0.02)
     with Display(3, quiet=True).running() as display:
@@ -283,5 +307,5 @@ def test_the_first_line_comes_first_and_a_stop_before_the_run_begins_says_so(tmp
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert line == "learning cartpole, model lagrangian, policy mlp: 15 trials, folder demo\n"
-    assert err == "stopped before anything was written to demo; the same command begins again\n"
+    assert err == "stopped before the first trial of demo; the same command begins again\n"
     assert process.returncode == 130

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import pegasus_jax as pg
+from folders import a_run
 from pegasus_jax import start
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.cli import train as cli_train
@@ -153,6 +154,15 @@ def test_what_cannot_be_learned_is_refused_before_a_folder_is_made(how: Any, mes
     with pytest.raises(pg.ConfigError, match=f"^{message}"):
         pg.train(**{"out": None if "resume" in how else tmp_path / "run", **how})
     assert not (tmp_path / "run").exists()
+
+
+def test_fewer_trials_than_are_done_are_refused_before_anything_else_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = a_run(tmp_path / "run", trials=3)
+    with pytest.raises(pg.ConfigError, match=r"^trials=2 is fewer than the 3 that are done; expected at least that$"):
+        pg.train(resume=run, settings={"trials": 2})
+    assert capsys.readouterr().out == ""
 
 
 def test_the_callers_precision_comes_back() -> None:

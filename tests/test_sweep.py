@@ -84,7 +84,7 @@ def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
         (["search.particles=3,100"], "search.particles=3 is too few"),
         (["search.grad_clip=1", "clipp=2"], "clipp is not a setting"),
         (["seeds=1,2"], "seeds=1,2 is not a whole number"),
-        (["jobs=0"], "jobs=0 is not a whole number"),
+        (["jobs=0"], "jobs=0 is out of range"),
         (["launcher=slrm"], "did you mean 'slurm'"),
         (["launcher=slurm"], "launcher="),  # neither the extra nor SLURM, or only one of them
     ],

@@ -17,7 +17,7 @@ from pegasus_jax.config import begins_with_policy, first_search
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.models.residual import FURTHEST, differences, on_differences, residual
-from pegasus_jax.runs import begin, checkpoint, config_io, restore, store
+from pegasus_jax.runs import begin, check, checkpoint, config_io, restore, store
 from pegasus_jax.runs.train import train
 from pegasus_jax.types import Batch, ModelLearner
 from pegasus_jax.vectorized import for_particles
@@ -256,6 +256,31 @@ def test_a_beginning_that_does_not_suit_is_one_line(words, part, simulator):
     with pytest.raises(ConfigError) as error:
         said(words)
     assert part in told(error)
+
+
+@pytest.mark.parametrize(
+    ("words", "part"),
+    [
+        (dict(init="nowhere"), "init=nowhere: nowhere is not a run"),
+        (dict(init="RUN", policy__hidden="[4]"), "has policy.hidden=[3], and this run [4]; policy.hidden=[3]"),
+        (dict(init="RUN", sensors__delay="1"), "before; that run has sensors.delay=0: say the same in both"),
+        (
+            dict(init="RUN", control_rate="100", sensors__delay="1"),
+            "; that run has sensors.delay=0 and control_rate=[]: say the same in both",
+        ),
+        (dict(init="RUN", history="2", search__particles="12"), "; that run has history=1: say the same in both"),
+        (dict(prior="nowhere.xml", model="log_normal"), "there is no such file"),
+        (dict(init="RUN"), ""),
+    ],
+)
+def test_a_check_says_of_a_beginning_what_training_does(words, part, simulator):
+    config = parse(**{name: text.replace("RUN", str(simulator)) for name, text in words.items()})
+    if part:
+        with pytest.raises(ConfigError) as error:
+            check.report(config)
+        assert part in told(error)
+    else:
+        assert any("begins with the policy of trial" in line for line in check.report(config))
 
 
 def test_angles_and_periods_of_another_task_are_told(simulator):

@@ -127,7 +127,7 @@ def env_spec(
     controls, seen = (getattr(env, space, None) for space in ("action_space", "observation_space"))
     for space, what in ((controls, "action_space"), (seen, "observation_space")):
         if not isinstance(space, gymnasium.spaces.Box) or len(space.shape) != 1:
-            raise ValueError(f"its {what} is {space}, not a Box of one dimension")
+            raise ValueError(f"its {what} is {space}, not a Box of one dimension{_way_out(what, space)}")
     assert isinstance(controls, gymnasium.spaces.Box)
     assert isinstance(seen, gymnasium.spaces.Box)
     low = filled("control_low", control_low, controls.shape[0], controls.low)
@@ -154,6 +154,15 @@ def env_spec(
     return EnvSpec(low, high, dt or period(env), horizon or limit or 100, mean, std, places, states, actions)
 
 
+def _way_out(what: str, space: Any) -> str:
+    """The end of a line that refuses a space: what makes a vector of numbers of it."""
+    if what == "action_space":
+        return "; controls must be numbers in a range, as Box(-1, 1, (2,))"
+    if getattr(space, "is_np_flattenable", False):
+        return "; register an environment that returns gymnasium.wrappers.FlattenObservation(env), which makes one"
+    return "; an observation must be numbers, as Box(-inf, inf, (4,))"
+
+
 def named(env: Any, what: str, given: Sequence[str], size: int) -> tuple[str, ...]:
     """The names given, or the environment's own; none where it has none. Raises ValueError for those that cannot be."""
     try:
@@ -172,12 +181,22 @@ def named(env: Any, what: str, given: Sequence[str], size: int) -> tuple[str, ..
 
 
 def period(env: Any) -> float:
-    """The environment's control period [s]: its `dt`, else its frames a second. Raises ValueError for another `dt`."""
+    """The environment's control period [s]; 1 where it tells none. Raises ValueError for a `dt` that is none."""
+    return told_period(env) or 1.0
+
+
+def told_period(env: Any) -> float | None:
+    """The environment's `dt` [s], else its frames a second; None where it has neither. Raises ValueError as above."""
+    frames = (env.metadata or {}).get("render_fps")
+    return own_period(env) or (1.0 / frames if frames else None)
+
+
+def own_period(env: Any) -> float | None:
+    """The environment's `dt` [s], or None. Raises ValueError for one that is no number of seconds."""
     try:
         dt = env.get_wrapper_attr("dt")
     except AttributeError:
-        frames = (env.metadata or {}).get("render_fps")
-        return 1.0 / frames if frames else 1.0
+        return None
     if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not 0 < dt < np.inf:
         raise ValueError(f"its dt is {dt!r}, not a number of seconds; give dt=")
     return float(dt)

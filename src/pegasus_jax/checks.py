@@ -165,8 +165,17 @@ def typed(section: str, node: Any) -> None:
             object.__setattr__(node, f.name, _as(f.type, given))
         except TypeError:
             name = f"{section}.{f.name}" if section else f.name
-            expected = f"{called(f.type)}; for example {name}={shown(f.default)}"
-            raise ConfigError(f"{name}={shown(given)} is not {expected}") from None
+            raise ConfigError(f"{name}={shown(given)} is not {expected(name, f.type, given, f.default)}") from None
+
+
+def expected(name: str, kind: Any, given: Any, default: Any) -> str:
+    """What a setting takes, in words, and an example: what is given in brackets where that is a list, or a default."""
+    places = ", which are places in the observation counted from 0" if name in PLACES else ""
+    example = default if default or kind not in EXAMPLES else EXAMPLES[kind]
+    if isinstance(given, numbers.Real):
+        with suppress(TypeError):
+            example = _as(kind, (given,))
+    return f"{called(kind)}{places}; for example {name}={shown(example)}"
 
 
 def _as(kind: Any, value: Any) -> Any:
@@ -187,6 +196,13 @@ def _as(kind: Any, value: Any) -> Any:
     raise TypeError(f"{value!r} is not {called(kind)}")
 
 
+PLACES = ("angles", "rates", "circles")  # settings that say which entries of an observation are something
+EXAMPLES: dict[Any, Any] = {  # of settings that are empty by default
+    tuple[int, ...]: (0,),
+    tuple[float, ...]: (0.5,),
+    tuple[tuple[int, ...], ...] | None: ((0, 1),),
+    tuple[tuple[float, ...], ...]: ((0.5, 0.0),),
+}
 FUNCTION = str | Callable | None  # of a setting that names a function, or from Python is one
 
 
@@ -234,7 +250,8 @@ def kind(section: str, value: str, kind: str) -> None:
 
 def whole(name: str, text: str) -> int:
     """The whole number of an option. Raises ConfigError when it is none, or 0 where nothing would be done."""
-    if not text.isdecimal() or (name in ("episodes", "seeds", "jobs") and int(text) < 1):
+    if not text.removeprefix("-").isdecimal():
         raise ConfigError(f"{name}={text} is not a whole number; for example {name}=20")
-    check_range(name, int(text), 0, 2**32 - 1 if name == "seed" else SIZES["trials"])
+    least = 1 if name in ("episodes", "seeds", "jobs") else 0
+    check_range(name, int(text), least, 2**32 - 1 if name == "seed" else SIZES["trials"])
     return int(text)

@@ -322,6 +322,8 @@ class Config:
             checks.check_range("control_rate", rate, 0, open_low=True)
         for deviation in self.start_std:
             checks.check_range("start_std", deviation, 0)
+        if self.start_std != Config.start_std:
+            check_spread(self)
         checks.check_range("success", self.success, 0, open_low=True)
         if self.dt is not None:
             checks.check_range("dt", self.dt, 0, checks.SIZES["dt"], open_low=True)
@@ -346,6 +348,15 @@ KINDS: dict[str, dict[str, Any]] = {
     "fit": {"adam": Fit(), "lbfgs": LBFGS()},
     "search": {"particles": Search(), "analytic": Analytic()},
 }
+
+
+def check_spread(config: Config) -> None:
+    """Raises ConfigError for an environment's start_std= without the start_mean= around which it would be."""
+    if uses(config.task, "env") and not config.start_mean:
+        raise ConfigError(
+            f"start_std={checks.shown(config.start_std)} needs start_mean=, around which it is; without it episodes"
+            " start as starts= or 100 resets say"
+        )
 
 
 def first_search(config: Config) -> int:

@@ -101,6 +101,11 @@ def _config_of(config: Config | str | None, given: dict[str, Any]) -> Config:
     if isinstance(config, Config):
         config_io.check_used(config.task, given)
         return config_io.override(config, config_io.values(config_io.without_random(given)))
+    if config is not None and not isinstance(config, str):
+        kind = type(config).__name__
+        raise ConfigError(
+            f"train takes a Config or the name of a preset, not a {kind}; run(compose(config, task)) learns one"
+        )
     return preset(config or "cartpole", settings=given)
 
 
@@ -152,6 +157,7 @@ def start(asked: Asked, command: str, configure: Callable[[], Mesh]) -> None:
     from pegasus_jax.runs import display, store
 
     done = None if asked.resumed is None else len(store.readable_trials(asked.resumed)[0])
+    store.enough(asked.config.trials, done or 0)
     print(display.announcement(asked.config, asked.home, len(asked.runs), done), flush=True)
     mesh = configure()
     from pegasus_jax.runs.programs import is_main_process
@@ -187,7 +193,7 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     from pegasus_jax.assembly.experiments import build
     from pegasus_jax.runs import first, restore
     from pegasus_jax.runs.begin import checked
-    from pegasus_jax.runs.check import RESETS, before_training, circles_found
+    from pegasus_jax.runs.check import RESETS, before_training, unsaid
     from pegasus_jax.runs.logged import read_config
     from pegasus_jax.tasks import resolve
 
@@ -200,7 +206,7 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     task = build(replace(first.loaded(config), seed=0), mesh).task
     resets = 1 if asked.config.start_mean else RESETS  # who says where episodes start has nobody reset a robot
     logs, notes = read_config(config, task)
-    notes = checked(config, task) + circles_found(asked.config, config) + before_training(config, task, resets) + notes
+    notes = checked(config, task) + unsaid(asked.config, config) + before_training(config, task, resets) + notes
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
     return config, logs

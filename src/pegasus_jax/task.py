@@ -3,6 +3,10 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+from jax.core import Tracer
+
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.types import NO_MEMORY, Array, Cost, Hindsight, Memory
 
 
@@ -58,3 +62,27 @@ class Task(NamedTuple):
     def may_end(self) -> bool:
         """Whether an episode may be shorter than the horizon."""
         return self.environment is not None or self.stop is not None
+
+
+def checked(task: Task) -> Task:
+    """The task itself. Raises ConfigError, in one line, where its fields do not agree.
+
+    A mistake in one that somebody wrote would come back as a shape from deep inside JAX, or not at all.
+    """
+    states, controls = len(task.state_names), len(task.control_names)
+    sizes = {"start_mean": states, "start_std": states, "sensor_std": states}
+    for name, size in (sizes | {"control_low": controls, "control_high": controls}).items():
+        if np.shape(getattr(task, name)) != (size,):
+            of = f"{size} {'states' if name in sizes else 'controls'}"
+            raise ConfigError(
+                f"the task's {name} has shape {np.shape(getattr(task, name))}; expected ({size},), of {of}"
+            )
+    if not isinstance(task.horizon, int | np.integer) or task.horizon < 1:
+        raise ConfigError(f"the task's horizon={task.horizon!r} is not a whole number of control periods, at least 1")
+    if wrong := [angle for angle in task.angles if angle not in range(states)]:
+        raise ConfigError(f"the task's angles={task.angles} has {wrong[0]}; its {states} states are 0 to {states - 1}")
+    if not any(isinstance(limit, Tracer) for limit in (task.control_low, task.control_high)):
+        for name, low, high in zip(task.control_names, task.control_low, task.control_high, strict=True):
+            if not low < high:
+                raise ConfigError(f"the task's limits of {name} are {low:g} and {high:g}; expected control_low first")
+    return task

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import lru_cache, partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from pegasus_jax.learn.data import room
 from pegasus_jax.models.residual import on_differences, residual
 from pegasus_jax.policies.rate_limited import rate_limited
 from pegasus_jax.sharding import over_particles
-from pegasus_jax.task import Task
+from pegasus_jax.task import Task, checked
 from pegasus_jax.tasks.remembered import remembering
 from pegasus_jax.types import (
     Array,
@@ -34,10 +35,25 @@ from pegasus_jax.types import (
 EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 
 
+def build(config: settings.Config, mesh: Mesh | None = None, logged: int = 0) -> Experiment:
+    """The experiment of a config, with room for `logged` rows of data besides those of the trials.
+
+    Cached: the same config gives the same functions, which compile once, and the same environment, which is opened
+    once. Raises ConfigError for what is no config.
+    """
+    if not isinstance(config, settings.Config):
+        raise ConfigError(f"build takes a Config, not a {type(config).__name__}; compose(config, task) takes both")
+    return _built(config, mesh, logged)
+
+
 @lru_cache(maxsize=64)
-def build(config: settings.Config, mesh: Mesh | None = None) -> Experiment:
-    """The experiment of a config. Cached: the same config gives the same functions, which compile once."""
-    return compose(config, tasks.of_config(config), mesh=mesh)
+def _built(config: settings.Config, mesh: Mesh | None, logged: int) -> Experiment:
+    return compose(config, _posed(config), mesh=mesh, logged=logged)
+
+
+@lru_cache(maxsize=64)
+def _posed(config: settings.Config) -> Task:
+    return tasks.of_config(config)
 
 
 def compose(
@@ -56,11 +72,13 @@ def compose(
 
     A `cost` may be a function of one state x [D] and, by these names, of u, previous_u, t, reference, goal. A
     `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
-    There is room for `logged` rows of data besides those of the trials.
-    With a `mesh` (sharding.py) the particles of a search are spread over its devices. Raises ConfigError where a piece
-    does not suit the config: moment matching, for example, needs more particles than states.
+    There is room for `logged` rows of data besides those of the trials. Controls of a policy of your own beyond the
+    task's limits are cut off at them, in imagination as on the plant. With a `mesh` (sharding.py) the particles of a
+    search are spread over its devices. Raises ConfigError for what is no piece, a task whose fields do not agree, and a
+    piece that does not suit the config: moment matching, for example, needs more particles than states.
     """
-    task = remembering(config, task._replace(cost=as_cost(task.cost)))
+    _of_kinds(dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher)
+    task = remembering(config, checked(task._replace(cost=as_cost(task.cost))))
     task = tasks.whole(task, None if cost is None else as_cost(cost))
     dynamics = dynamics or dynamics_of(config.model, task)
     fitter = fitter or drawing_rates(fit_of(config.fit, dynamics), dynamics, task)
@@ -69,7 +87,7 @@ def compose(
         dynamics = residual(dynamics, task.prior, angles=task.angles)
     visits = bool(config.search.visited_starts) and searcher is None
     dynamics = visited.remembering(dynamics) if visits else dynamics
-    policy = policy or policy_of(config.policy, task)
+    policy = policy_of(config.policy, task) if policy is None else within(policy, task)
     policy = rate_limited(policy._replace(memory=task.memory) if task.memory.names else policy, task)
     searching = search_of(config.search, task, dynamics, policy, over_particles(mesh))
     return experiment(
@@ -111,6 +129,34 @@ def explore_of(explore: settings.Explore, task: Task) -> Callable[[Key], Array]:
     if task.guide is not None:
         return lambda key: episode.gently(plan(key), amplitude or 0.0, low, high) - jnp.clip(0.0, low, high)
     return plan if amplitude is None else lambda key: episode.gently(plan(key), amplitude, low, high)
+
+
+PIECES = {"dynamics": Dynamics, "policy": Policy, "fitter": ModelLearner, "searcher": PolicyOptimizer}
+
+
+def _of_kinds(**pieces: Any) -> None:
+    """Raises ConfigError for a piece of another kind: one of optax, for example, has an `init`, too."""
+    for name, piece in pieces.items():
+        if piece is not None and not isinstance(piece, PIECES[name]):
+            helps = {
+                "fitter": "; minibatches(dynamics, optimizer, batch_size=) makes one",
+                "policy": "; of_pair makes one",
+            }
+            raise ConfigError(
+                f"{name}={type(piece).__name__} is no {PIECES[name].__name__}; expected"
+                f" pegasus_jax.{PIECES[name].__name__}({', '.join(PIECES[name]._fields)}){helps.get(name, '')}"
+            )
+
+
+def within(policy: Policy, task: Task) -> Policy:
+    """The policy, whose controls are cut off at the task's limits."""
+    low, high = limits(task)
+
+    def apply(*given: Any) -> Array:
+        u = policy.apply(*given)
+        return jnp.clip(u, low, high) if jnp.shape(u) == low.shape else u  # else who asked for it names the shape
+
+    return policy._replace(apply=apply)
 
 
 def as_cost(cost: Cost | Callable[[Array], Array]) -> Cost:

@@ -1,6 +1,7 @@
 """The command pegasus-export: a run's policy as a file that runs without this package."""
 
 import json
+import sys
 from collections.abc import Sequence
 
 from pegasus_jax.checks import ConfigError
@@ -40,6 +41,9 @@ def handle(words: Sequence[str]) -> None:
     if rest["overwrite"] not in ("true", "false"):
         raise ConfigError(f"overwrite={rest['overwrite']} is neither true nor false")
     trial = trial_of(rest["trial"])
+    # At once: to import JAX and to compile the policy takes a while. Standard output is for what was written.
+    told = f"exporting {run}, and comparing the file with its policy on 1,000 observations"
+    print(told, file=sys.stderr, flush=True)
     from pegasus_jax.exports import write
     from pegasus_jax.runs.restore import chosen
 

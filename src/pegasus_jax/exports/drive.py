@@ -75,7 +75,7 @@ def drives(
     check_range("watchdog", limit, task.dt, open_low=True)
     task = task._replace(horizon=task.horizon if seconds is None else max(1, round(seconds / task.dt)))
     print(restore.chosen(run, trial, int(state.trial)), file=sys.stderr)
-    print(_announced(task, int(state.trial), limit), file=sys.stderr)
+    print(f"preparing the controller of trial {int(state.trial)}; nothing moves yet", file=sys.stderr, flush=True)
     with tempfile.TemporaryDirectory() as folder:
         control = runpy.run_path(str(export(run, int(state.trial), out=Path(folder) / "policy.py")))["Controller"]()
     gc.freeze()  # nothing that is there is looked at by the garbage collector while the robot moves
@@ -91,7 +91,7 @@ def drives(
 
 
 def _announced(task: Task, trial: int, limit: float) -> str:
-    """What will drive, before it does."""
+    """What drives, said directly before it does: the reset may move a robot already."""
     limits = zip(task.control_names, task.control_low, task.control_high, strict=True)
     sent = ", ".join(f"{name} from {low:g} to {high:g}" for name, low, high in limits)
     period = f"every {task.dt:g} s for {task.horizon * task.dt:g} s, watchdog {limit:g} s"
@@ -129,6 +129,7 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
         save(Episode(Trajectory(np.array(x), np.array(u).reshape(-1, size), np.zeros(0)), "interrupted"))  # type: ignore[arg-type]
         return _stopped(task, limit, len(u), log)
 
+    print(_announced(task, policy, limit), file=sys.stderr, flush=True)
     with Watchdog(limit, task.environment.close, last_words) as watch:
         on_time = task._replace(environment=timed(task.environment, task.dt, times, rows, watch.beat))
         ran = drive(seed, act, on_time)

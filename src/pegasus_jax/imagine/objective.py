@@ -7,7 +7,7 @@ import jax.numpy as jnp
 
 from pegasus_jax.imagine import costs
 from pegasus_jax.imagine.rollout import rollout
-from pegasus_jax.types import Array, Params, Scenarios
+from pegasus_jax.types import Array, Cost, Params, Scenarios
 
 
 def objective(
@@ -15,15 +15,26 @@ def objective(
     posterior: Params,
     scenarios: Scenarios,
     *,
-    cost: Callable[[Array], Array],
+    cost: Cost | Callable[[Array], Array],
     aggregate: Callable[[Array], Array] = costs.mean,
     **how: Any,
 ) -> Array:
-    """J(theta) (Alg. 3 line 15): cost [H, K, D] -> [H, K] of the rollout's states, made one number by `aggregate`.
+    """J(theta) (Alg. 3 line 15): the costs [H, K] of the rollout's states, made one number by `aggregate`.
 
-    `how` are the keywords of `rollout`: dynamics, policy, match, and maybe noise and limit.
+    `cost` is a task's, or a function of all states x [H, K, D] -> [H, K], or -> [H, 1] where it is one for all
+    particles. `how` are the keywords of `rollout`: dynamics, policy, match, and maybe noise and limit. As no gradient
+    flows through predicted noise, differences agree with it where that is constant, or with noise=NoiseUse(policy=0).
+
+    Raises ValueError, while it is traced, for costs of another shape.
     """
-    return aggregate(cost(rollout(policy_params, posterior, scenarios, **how).x[1:]))
+    each = costs.of_particles(cost) if isinstance(cost, Cost) else cost
+    x = rollout(policy_params, posterior, scenarios, **how).x[1:]
+    if jnp.shape(found := each(x)) not in (x.shape[:2], (len(x), 1)):
+        raise ValueError(
+            f"cost(x) of states {x.shape} has shape {jnp.shape(found)}; expected [H, K] {x.shape[:2]}:"
+            " costs.of_particles(Cost(function)) makes that of a function of one state"
+        )
+    return aggregate(found)
 
 
 def either(condition: Array | None, yes: Callable[..., Array], no: Callable[..., Array]) -> Callable[..., Array]:

@@ -32,7 +32,7 @@ def blocks(
     start: Callable[[Key], Array],
     particles: int,
     horizon: int,
-    standardized_noise: bool,
+    standardized_noise: bool = False,
     spread: Spread = together,
 ) -> Blocks:
     """How each part of the scenarios is drawn; `start` draws a first state [D], the policy's memory what is known.
@@ -65,7 +65,7 @@ def blocks(
     )
 
 
-def draw(key: Key, step: Array | int, posterior: Params, *, blocks: Blocks, period: Period) -> Scenarios:
+def draw(key: Key, step: Array | int, posterior: Params, *, blocks: Blocks, period: Period = Period()) -> Scenarios:
     """The scenarios in force at a search iteration: starts [K, D], normal draws [H, K, D], ...
 
     Block b at iteration i is drawn from fold_in(fold_in(key, b), i // period_b): any iteration's scenarios can be had

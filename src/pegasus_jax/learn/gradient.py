@@ -17,7 +17,7 @@ class SearchInfo(NamedTuple):
 
     objective: Array  # [steps]; where an iteration ends with a comparison, that of the policy that goes on
     gradient_norm: Array  # [steps] before clipping
-    skipped: Array  # [] updates skipped because a gradient was not finite
+    skipped: Array  # [] updates skipped because the objective or its gradient was not finite
     iterations: Array | None = None  # [] how many were done; the rest are NaN; None: all
 
 
@@ -33,14 +33,14 @@ def gradient_search(
 ) -> tuple[TrainState, SearchInfo]:
     """Alg. 3 as printed: `steps` updates along the gradient of `objective` under the scenarios of each iteration.
 
-    The learner is policy parameters and `optimizer.init` of them. A gradient that is not finite changes nothing. The
-    information has an entry for each of the N steps, [N].
+    The learner is policy parameters and `optimizer.init` of them. Where the objective or its gradient is not finite, an
+    update changes nothing. The information has an entry for each of the N steps, [N].
     """
 
     def step(carry: tuple[TrainState, Scenarios], i: Array) -> tuple[tuple[TrainState, Scenarios], SearchInfo]:
         learner, scenarios = carry
         value, gradient = jax.value_and_grad(objective)(learner.params, posterior, scenarios)
-        finite = is_finite(gradient)
+        finite = is_finite((value, gradient))
         updates, state = update_if(finite, optimizer, gradient, learner, value=value)
         learner = TrainState(optax.apply_updates(learner.params, updates), state)
         info = SearchInfo(value, optax.tree.norm(gradient), ~finite)

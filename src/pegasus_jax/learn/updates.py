@@ -1,4 +1,4 @@
-"""Updates that a gradient with a non-finite entry does not make: what a fit and a search share."""
+"""Updates that a number that is not finite does not make: what a fit and a search share."""
 
 from typing import Any
 
@@ -9,9 +9,9 @@ import optax
 from pegasus_jax.types import Array, Params, TrainState
 
 
-def is_finite(gradient: Params) -> Array:
-    """[] whether every entry is."""
-    return jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(gradient)]))
+def is_finite(numbers: Params) -> Array:
+    """[] whether every entry is; of no entries, as of a model that is known, they are."""
+    return jnp.all(jnp.array([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(numbers)], bool))
 
 
 def update_if(

@@ -71,13 +71,14 @@ def layout(table: Table, names: Names, columns: Sequence[str]) -> tuple[Layout, 
     be told.
     """
     said, known = mapped(columns, names), (*names.observation, *names.control)
-    time = said.get("t") or next((Column(name) for name in TIMES if name in table.names), None)
+    own = matched([name for name in table.names if name not in {*TIMES, EPISODE} - {*known}], known)
+    taken = {column.name for column in said.values()} or {*own.values()}
+    time = said.get("t") or _time(table.names, taken)
     episode = said[EPISODE].name if EPISODE in said else EPISODE if EPISODE in table.names else None
     note = ""
     if not said:
         rest = [name for name in table.names if name not in (episode, time and time.name)]
-        own = {plain(name): name for name in rest}
-        if not {*known} & {*own}:
+        if not own:
             if len(rest) != len(known):
                 raise ConfigError(
                     f"{table.source} has {len(rest)} columns, {', '.join(rest)}; expected {len(known)}:"
@@ -96,6 +97,34 @@ def layout(table: Table, names: Names, columns: Sequence[str]) -> tuple[Layout, 
     return Layout(
         tuple(said[name] for name in names.observation), tuple(said[name] for name in names.control), time, episode
     ), note
+
+
+def matched(columns: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """Name -> the column of that name, units aside; else the one that differs in case or has _ for a space.
+
+    A column that some name has exactly is no other's, and of two that are alike neither is taken.
+    """
+    exact = {plain(column): column for column in columns}
+    found = {name: exact[name] for name in names if name in exact}
+    alike: dict[str, list[str]] = {}
+    for column in columns:
+        if column not in found.values():
+            alike.setdefault(_loose(plain(column)), []).append(column)
+    for name in names:
+        if name not in found and len(alike.get(_loose(name), ())) == 1:
+            found[name] = alike[_loose(name)].pop()
+    return found
+
+
+def _time(columns: Sequence[str], taken: set[str]) -> Column | None:
+    """The column of the time [s], or None. T, which may be a torque or a temperature, is time where it is first."""
+    found = [name for name in TIMES if name in columns]
+    found += [name for name in columns if name.casefold() == "time"] + [name for name in columns[:1] if name == "T"]
+    return next((Column(name) for name in found if name in TIMES or name not in taken), None)
+
+
+def _loose(name: str) -> str:
+    return name.casefold().replace("_", " ")
 
 
 def numbers(table: Table, column: Column) -> np.ndarray:

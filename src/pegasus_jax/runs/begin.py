@@ -56,7 +56,9 @@ def checked(config: Config, task: Task) -> list[str]:
         ("controls", len(task.control_names), len(theirs.control_names)),
     ):
         if mine != its:
-            raise ConfigError(f"{what} is of {theirs.name} with {its} {name}, and {task.name} has {mine}")
+            raise ConfigError(
+                f"{what} is of {theirs.name} with {its} {name}, and {task.name} has {mine}{remembered(old, config)}"
+            )
     if tuple(task.angles) != tuple(theirs.angles):
         raise ConfigError(
             f"{what} is of {theirs.name} with angles={shown(list(theirs.angles))}, and {task.name} has"
@@ -64,7 +66,8 @@ def checked(config: Config, task: Task) -> list[str]:
         )
     mine, its = (", ".join(seen_names(one)) for one in (task, theirs))
     if len(seen_names(task)) != len(seen_names(theirs)):
-        raise ConfigError(f"{what} has a policy that sees {its}, and here it would see {mine}")
+        why = remembered(old, config) or "; say the same sensors., history= and control_rate= words in both runs"
+        raise ConfigError(f"{what} has a policy that sees {its}, and here it would see {mine}{why}")
     for part in config.init_parts:
         its, mine = (config_io.leaves(getattr(one, part), f"{part}.") for one in (old, config))
         for name in its:
@@ -84,6 +87,15 @@ def checked(config: Config, task: Task) -> list[str]:
         if not np.allclose(mine, its):
             notes.append(f"{name} of {theirs.name} is {shown(its.tolist())}, here {shown(mine.tolist())}")
     return notes
+
+
+def remembered(old: Config, config: Config) -> str:
+    """The end of a line that two policies see different things: the words that make it so, or "" where none do."""
+    its, mine = (config_io.leaves(one.sensors, "sensors.") for one in (old, config))
+    for name in ("history", "control_rate", "goal_low"):
+        its, mine = its | {name: getattr(old, name)}, mine | {name: getattr(config, name)}
+    words = [f"{name}={shown(its[name])}" for name in its if its[name] != mine[name]]
+    return f"; that run has {' and '.join(words)}: say the same in both" if words else ""
 
 
 def copy(config: Config, run: Path) -> None:

@@ -14,10 +14,10 @@ from pegasus_jax.imagine import costs
 from pegasus_jax.math.circles import entries
 from pegasus_jax.math.units import parted
 from pegasus_jax.policies.rate_limited import largest_change
-from pegasus_jax.runs import first
+from pegasus_jax.runs import begin, first
 from pegasus_jax.runs.logged import read_config
 from pegasus_jax.task import Task
-from pegasus_jax.tasks import constrained, cost_check, guide, user_code
+from pegasus_jax.tasks import assumed, constrained, cost_check, guide, user_code
 
 RESETS = 20  # of an environment that may be reset without need
 EXACT = 1e-4  # of an entry's spread: what is left of it is rounding
@@ -74,6 +74,11 @@ def slow(task: Task) -> list[str]:
         elif (periods := (high - low) / change) > task.horizon:
             notes.append(f"control_rate={rate:g} lets {way} in {periods:.0f} periods; an episode has {task.horizon}")
     return notes
+
+
+def unsaid(given: Config, known: Config) -> list[str]:
+    """Notes on what the user did not say of an environment, and what is taken for it; `known` is what is."""
+    return assumed.notes(given) + circles_found(given, known)
 
 
 def circles_found(given: Config, known: Config) -> list[str]:
@@ -176,8 +181,9 @@ def report(config: Config) -> list[str]:
     set_precision(config)
     asked, config = config, tasks.resolve(config)
     task = build(replace(first.loaded(config), seed=0)).task
-    notes = circles_found(asked, config) + before_training(config, task, 1 if given else RESETS)
-    notes += read_config(config, task)[1]
+    logs = read_config(config, task)[1]
+    notes = begin.checked(config, task) + unsaid(asked, config)
+    notes += before_training(config, task, 1 if given else RESETS) + logs
     wide = width(config, begun := at_starts(task))
     facts: dict[str, Any] = {
         "task": " ".join([config.task, *([task.name] if task.name != config.task else [])]),

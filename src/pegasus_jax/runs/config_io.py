@@ -11,8 +11,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
-from pegasus_jax.checks import FUNCTION, ConfigError, called, did_you_mean, shown
-from pegasus_jax.config import KINDS, TASKS, Config, Explore, uses
+from pegasus_jax.checks import FUNCTION, ConfigError, did_you_mean, expected, shown
+from pegasus_jax.config import KINDS, TASKS, Config, Explore, check_spread, uses
 from pegasus_jax.presets import WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.removed import refuse, today
@@ -64,6 +64,8 @@ def parse(words: Mapping[str, Any], options: Sequence[str] = ()) -> Config:
             raise ConfigError(f"{key} is not a setting; {_hint(key, [*known, *NAMED, *options])}")
         check_used(config.task, {key: words[key]})
     changed = override(config, values(words))
+    if "start_std" in words:
+        check_spread(changed)
     if changed.legs != config.legs:
         raise ConfigError(f"preset={begin} is for legs={config.legs}; with legs={changed.legs} leave out preset=")
     return changed
@@ -241,6 +243,4 @@ def _converted(node: Any, name: str, value: Any, key: str) -> Any:
         assert isinstance(merged, DictConfig)
         return getattr(OmegaConf.to_object(merged), name)
     except (OmegaConfBaseException, AssertionError, TypeError, ValueError) as error:
-        raise ConfigError(
-            f"{key}={shown(value)} is not {called(field.type)}; for example {key}={shown(current)}"
-        ) from error
+        raise ConfigError(f"{key}={shown(value)} is not {expected(key, field.type, value, current)}") from error

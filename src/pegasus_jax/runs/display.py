@@ -100,13 +100,15 @@ class Display:
     @contextmanager
     def compiling(self, part: str) -> Iterator[None]:
         """Say so while the caller waits for a part's compiled program, which happens once."""
-        before, began = self.what, time.monotonic()
+        before, stage, said, began = self.what, self.stage, self.said, time.monotonic()
         self._show(f"compiling {PARTS.get(part, part)} (once)")
         try:
             yield
         finally:
             self.clock.compiled += time.monotonic() - began
-            self._show(before)
+            self._show(before, stage=stage)
+            if said == stage:  # it had its line before, and has no second one
+                self.said = said
 
     def trial(self, rows: Sequence[dict[str, Any]]) -> None:
         """A trial is done, with these rows, one a seed: a row of the table, or a line of a log."""
@@ -224,7 +226,7 @@ def devices() -> str:
 def stopped(home: Path) -> str:
     """What a person who has stopped a run can do next."""
     if not (home / "config.yaml").exists() and not any(home.glob("seed*/config.yaml")):
-        return f"stopped before anything was written to {home}; the same command begins again"
+        return f"stopped before the first trial of {home}; the same command begins again"
     return f"stopped; every finished episode is kept, {typed(['pegasus-train', f'resume={home}'])} goes on"
 
 
@@ -253,8 +255,11 @@ def summary(rows: Sequence[dict[str, Any]], trials: int, best: int | None = None
 
 def waited(seconds: dict[str, float]) -> str:
     """How long a robot stands still until its next episode, and how much of that the compiler takes."""
-    compiling = f", {seconds['compile']:.1f} s of them compiling" if seconds["compile"] >= 0.05 else ""
-    return f"{seconds['between_episodes']:.1f} s until the next episode{compiling}"
+    between = seconds["between_episodes"]
+    # What is counted is the whole trial's, of which some was compiled before its episode: a part is never the larger.
+    compiled = min(seconds["compile"], between)
+    compiling = f", {compiled:.1f} s of them compiling" if compiled >= 0.05 else ""
+    return f"{between:.1f} s until the next episode{compiling}"
 
 
 def executed(rows: Sequence[dict[str, Any]]) -> str:
@@ -285,8 +290,11 @@ def learned(rows: Sequence[dict[str, Any]]) -> str:
         parts += [f"cost {_mean(rows, 'mean_cost'):.3f}", f"success {_mean(rows, 'success_rate'):.0%}"]
     if (imagined := _mean(rows, "objective_fresh")) is not None:
         parts.append(f"imagined cost {imagined:.3f}")
-    kept = all(row.get("replaced") is False for row in rows)
-    return f"policy {'kept' if kept else 'now'}: {', '.join(parts)}" if parts else ""
+    if all(row.get("policy") == 0 and row["objective_fresh"] is None for row in rows):
+        which = "first policy, before any search"
+    else:
+        which = "policy kept" if all(row.get("replaced") is False for row in rows) else "policy now"
+    return f"{which}: {', '.join(parts)}" if parts else ""
 
 
 def skipped(rows: Sequence[dict[str, Any]]) -> str:

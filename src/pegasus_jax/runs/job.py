@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.sharding import Mesh
 
 from pegasus_jax import tasks
-from pegasus_jax.assembly.experiments import build, capacity, compose, set_precision
+from pegasus_jax.assembly.experiments import build, capacity, set_precision
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.imagine import costs
@@ -48,9 +48,7 @@ def opened(config: Config, seeds: Sequence[int], mesh: Mesh | None = None, logs:
     """
     set_precision(config)
     loaded = first.loaded(config)
-    experiment = build(replace(loaded, seed=0), mesh)  # the seed is in the key, so that all share one program
-    if logs.rows:
-        experiment = compose(loaded, experiment.task, mesh=mesh, logged=logs.rows)
+    experiment = build(replace(loaded, seed=0), mesh, logs.rows)  # the seed is in the key: all share one program
     try:
         kept = traced.store(config, len(seeds), alone=mesh is None)
         program = Program(experiment, config.search.steps, len(seeds), mesh, traced=kept)

@@ -79,6 +79,12 @@ def _unused(path: Path) -> None:
             raise ConfigError(f"out={path} holds {name} of a run without its config.yaml; out={free(path)} is free")
 
 
+def enough(trials: int, done: int) -> None:
+    """Raises ConfigError where a run is to end before the trials that it has done."""
+    if done > trials:
+        raise ConfigError(f"trials={trials} is fewer than the {done} that are done; expected at least that")
+
+
 def existing(path: Path) -> Path:
     """The folder of a run. Raises RunError when there is none, or something in it is no file or no folder."""
     if not (path / "config.yaml").exists():

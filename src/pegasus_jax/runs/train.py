@@ -17,7 +17,6 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from pegasus_jax import episode
-from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config, begins_with_policy, first_search
 from pegasus_jax.experiment import EVALUATE, trial_key
 from pegasus_jax.learn.fit import FitInfo
@@ -90,8 +89,7 @@ def train_seeds(
             if not resume:
                 begin.copy(config, run)
         before = config_io.load(folders[0] / "config.yaml") if resume else config
-        if (most := max([0, *(trial for run in folders for trial in checkpoint.available(run))])) > config.trials:
-            raise ConfigError(f"trials={config.trials} is fewer than the {most} that are done; expected at least that")
+        store.enough(config.trials, max([0, *(trial for run in folders for trial in checkpoint.available(run))]))
         begun = logged.of_run(config, folders[0]) if resume else logged.of_config(config, logs)
         closing = held.enter_context(ExitStack())  # of what may wait for a network: a robot is let go before
         job = held.enter_context(opened(config, list(runs), mesh, begun))

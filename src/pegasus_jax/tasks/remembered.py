@@ -18,15 +18,19 @@ WINDOW, ORDER = 5, 3  # rows of the local polynomial that tells rates afterwards
 
 
 def remembering(config: Config, task: Task) -> Task:
-    """The task with what its controller remembers, and its states as they are known afterwards, by the settings."""
+    """The task with what its controller remembers, and its states as they are known afterwards, by the settings.
+
+    What it remembers already, as the task of an experiment does, it remembers once.
+    """
     task = task._replace(control_rate=limited_by(config, task))
-    kept, memories = kept_by(config, task), [task.memory]
+    kept, memories, known = kept_by(config, task), list[Memory](), {*task.memory.names}
     if kept.controls:
         memories.append(history(task, rows=1 + kept.rows, delay=config.sensors.delay, controls=kept.controls))
     if kept.rates:
         memories.append(velocities(task, kept.weight))
         task = task._replace(hindsight=Hindsight(partial(smoothed, task=task), 1))
-    return task._replace(memory=combined(*memories))
+    new = (memory for memory in memories if not {*memory.names} <= known)
+    return task._replace(memory=combined(task.memory, *new))
 
 
 class Kept(NamedTuple):

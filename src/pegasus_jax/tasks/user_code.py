@@ -155,7 +155,7 @@ def definition(function: Any) -> str | None:
 def _users(file: str) -> bool:
     """Whether a line in this file is the user's, not Python's, JAX's, Gymnasium's or ours."""
     path = Path(file)
-    if file.startswith("<") or path.is_relative_to(Path(__file__).parent) or "pegasus_envs" in path.parts:
+    if file.startswith("<") or path.is_relative_to(Path(__file__).parents[1]) or "pegasus_envs" in path.parts:
         return False
     for folder in INSTALLED:
         if folder in path.parts:

@@ -1,0 +1,42 @@
+"""What a Gymnasium environment, and the user, left unsaid, and what is taken for it: notes, one line each."""
+
+from contextlib import suppress
+
+import numpy as np
+
+from pegasus_jax.config import GYM, Config
+
+
+def notes(given: Config) -> list[str]:
+    """Notes on a config as it was `given`, whose environment is open: its period, and its episodes that only measure.
+
+    Nothing tells a default from the same number said by the user, so the latter is told what it means too.
+    """
+    if given.task != GYM:
+        return []
+    told = period(given)
+    if given.eval_episodes == Config.eval_episodes:
+        told.append(
+            f"after each trial the environment runs {given.eval_episodes} more episodes, which only measure the policy"
+            " and are not learned from; eval_episodes=0 leaves them out"
+        )
+    return told
+
+
+def period(given: Config) -> list[str]:
+    """The note that nobody said the control period, or that two said different ones; or none."""
+    from pegasus_envs.gym_plant import make_env, own_period, told_period
+
+    env, what = make_env(given.env or "", given.env_args), f"env={given.env}"
+    if given.dt is None:
+        assumed = f"{what} says no dt; a period of 1 s is assumed, at which pegasus-run drives; dt=0.05 says another"
+        return [assumed] if told_period(env) is None else []
+    own = None
+    with suppress(ValueError):  # of an attribute that is no period, which dt= replaces
+        own = own_period(env)
+    if own is None or np.isclose(given.dt, own, rtol=1e-3):
+        return []
+    return [
+        f"dt={given.dt:g}, and {what} has dt {own:g}: times, rates and pegasus-run go by dt={given.dt:g}, which does"
+        " not change the environment; leave it out unless it is right"
+    ]
