@@ -132,20 +132,15 @@ def explore_of(explore: settings.Explore, task: Task) -> Callable[[Key], Array]:
 
 
 PIECES = {"dynamics": Dynamics, "policy": Policy, "fitter": ModelLearner, "searcher": PolicyOptimizer}
+HELPS = {"fitter": "; minibatches(dynamics, optimizer, batch_size=) makes one", "policy": "; of_pair makes one"}
 
 
 def _of_kinds(**pieces: Any) -> None:
     """Raises ConfigError for a piece of another kind: one of optax, for example, has an `init`, too."""
     for name, piece in pieces.items():
-        if piece is not None and not isinstance(piece, PIECES[name]):
-            helps = {
-                "fitter": "; minibatches(dynamics, optimizer, batch_size=) makes one",
-                "policy": "; of_pair makes one",
-            }
-            raise ConfigError(
-                f"{name}={type(piece).__name__} is no {PIECES[name].__name__}; expected"
-                f" pegasus_jax.{PIECES[name].__name__}({', '.join(PIECES[name]._fields)}){helps.get(name, '')}"
-            )
+        if piece is not None and not isinstance(piece, kind := PIECES[name]):
+            expected = f"pegasus_jax.{kind.__name__}({', '.join(kind._fields)}){HELPS.get(name, '')}"
+            raise ConfigError(f"{name}={type(piece).__name__} is no {kind.__name__}; expected {expected}")
 
 
 def within(policy: Policy, task: Task) -> Policy:

@@ -1,8 +1,6 @@
 """Line 3 of Alg. 1 as a job does it: the episodes of a trial, each durable before anything is learned from it."""
 
 from contextlib import nullcontext
-from pathlib import Path
-from traceback import extract_tb
 
 import jax
 import numpy as np
@@ -96,14 +94,8 @@ def failed(ran: Episode, task: Task, advice: str = "", kept: bool = True) -> Non
         rows = f"; its {count} rows are kept" if kept and count else ""
         when = f"control period {count + 1}" if len(ran.trajectory.x) else "the reset"
         refused = f"{when} of an episode: {ran.error}"
-        what = refused if ours(ran.error) else f"an episode, {user_code.told(ran.error)}"
+        what = refused if user_code.is_refusal(ran.error) else f"an episode, {user_code.told(ran.error)}"
         raise RunError(f"{task.name} failed in {what}{rows}{advice}") from ran.error
-
-
-def ours(error: BaseException) -> bool:
-    """Whether this package refused an environment's answer, in words of its own: no line of the user's raised it."""
-    frames = extract_tb(error.__traceback__)
-    return isinstance(error, ValueError) and bool(frames) and "pegasus_envs" in Path(frames[-1].filename).parts
 
 
 def stacked(episodes: list[Episode], task: Task) -> Trajectory:

@@ -137,6 +137,12 @@ def line_of(error: BaseException) -> str | None:
     return place_of([(frame.filename, frame.lineno or 0) for frame in extract_tb(error.__traceback__)])
 
 
+def is_refusal(error: BaseException) -> bool:
+    """Whether this package refused what the user's code answered, in words of its own: a line of ours raised it."""
+    frames = extract_tb(error.__traceback__)
+    return isinstance(error, ValueError) and bool(frames) and _ours(Path(frames[-1].filename))
+
+
 def place_of(lines: Iterable[tuple[str, int]]) -> str | None:
     """`file.py:line` of the last of these (file, line) that is the user's, if it can be not an installed package's."""
     theirs = [(file, line) for file, line in lines if _users(file)]
@@ -155,12 +161,16 @@ def definition(function: Any) -> str | None:
 def _users(file: str) -> bool:
     """Whether a line in this file is the user's, not Python's, JAX's, Gymnasium's or ours."""
     path = Path(file)
-    if file.startswith("<") or path.is_relative_to(Path(__file__).parents[1]) or "pegasus_envs" in path.parts:
+    if file.startswith("<") or _ours(path):
         return False
     for folder in INSTALLED:
         if folder in path.parts:
             return path.parts[path.parts.index(folder) + 1] not in LIBRARIES
     return not any(path.is_relative_to(folder) for folder in STANDARD)
+
+
+def _ours(path: Path) -> bool:
+    return path.is_relative_to(Path(__file__).parents[1]) or "pegasus_envs" in path.parts
 
 
 def _within(path: Path, folder: Path) -> bool:
