@@ -95,8 +95,10 @@ def test_a_bad_gradient_skips_its_update_and_nothing_else(value):
     assert again.skipped == sum(bad[40:])  # each call counts its own
 
 
-def test_a_fit_that_sees_nothing_but_bad_gradients_changes_nothing():
-    fitted, learner = make(lambda p, key, batch, context: jnp.sum(p) * jnp.nan)
+@pytest.mark.parametrize("spoil", [lambda total: total * jnp.nan, lambda total: total + jnp.nan])
+def test_a_fit_that_sees_nothing_but_bad_numbers_changes_nothing(spoil):
+    """Bad gradients, then good ones of a bad loss."""
+    fitted, learner = make(lambda p, key, batch, context: spoil(jnp.sum(p)))
     after, info = fitted(jax.random.key(0), learner, data(0))
     assert same(after.params, learner.params)
     assert same(after.optimizer, learner.optimizer)

@@ -18,7 +18,7 @@ class FitInfo(NamedTuple):
 
     loss: Array  # [] mean over the last tenth of the steps [nats a row]
     first: Array  # [] the same over the first tenth
-    skipped: Array  # [] updates skipped because a gradient was not finite
+    skipped: Array  # [] updates skipped because a loss or its gradient was not finite
 
 
 def fit(
@@ -34,8 +34,8 @@ def fit(
 ) -> tuple[TrainState, FitInfo]:
     """`steps` updates of the model's parameters, each on `batch_size` rows of the [N, D] in use (Alg. 1 line 5).
 
-    `optimizer` is any of optax, and `learner.optimizer` its state, `optimizer.init(params)`. A gradient with a
-    non-finite entry changes neither. An optimizer that searches along a line gets the loss of the same rows and noise.
+    `optimizer` is any of optax, and `learner.optimizer` its state, `optimizer.init(params)`. A loss or a
+    gradient that is not finite changes neither. An optimizer that searches along a line gets the loss of the same rows and noise.
     Raises ValueError for data of other shapes than a `Dataset` has.
     """
     check_data(data)
@@ -49,7 +49,7 @@ def fit(
             return loss(params, noise_key, rows, context)
 
         value, gradient = jax.value_and_grad(of_rows)(learner.params)
-        finite = is_finite(gradient)
+        finite = is_finite((value, gradient))
         more = dict(value=value, grad=gradient, value_fn=of_rows)
         updates, state = update_if(finite, optimizer, gradient, learner, **more)
         return TrainState(optax.apply_updates(learner.params, updates), state), (value, finite)
