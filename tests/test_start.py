@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +14,11 @@ import pytest
 
 import pegasus_jax as pg
 from folders import a_run
-from pegasus_jax import start
+from pegasus_jax import start, tasks
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.cli import train as cli_train
 from pegasus_jax.runs import checkpoint, config_io, programs, restore, store
+from pegasus_jax.runs.collect import other_cost
 
 TINY: dict[str, Any] = {
     "model.hidden": (4,),
@@ -33,6 +36,10 @@ def upright(x: jax.Array) -> jax.Array:
     """Of an observation of Pendulum-v1: cosine, sine, rate."""
     assert x.shape == (3,)
     return 1 - jnp.exp(-((x[0] - 1) ** 2 + x[1] ** 2))
+
+
+def half(x: jax.Array) -> jax.Array:
+    return upright(x) / 2
 
 
 def fingerprint(run: Path) -> str:
@@ -66,8 +73,8 @@ def test_python_leaves_what_the_command_leaves(
 
 
 @pytest.mark.slow
-def test_a_cost_is_a_function_of_an_observation(tmp_path: Path) -> None:
-    """Cosine and sine, though the policy has their angle. The run is read without it, and goes on with it alone."""
+def test_a_cost_is_a_function_of_an_observation(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """Cosine and sine, though the policy has their angle. The run is read without it, and goes on with one alone."""
     run = pg.train("gym", out=tmp_path / "run", settings=PENDULUM, cost=upright)
     ran = store.load_episode(run, 2)
     assert ran is not None
@@ -78,7 +85,14 @@ def test_a_cost_is_a_function_of_an_observation(tmp_path: Path) -> None:
     stored = config_io.load(run / "config.yaml").cost
     assert stored == f"{__name__}:upright"
     assert pg.controller(run)(np.array([1.0, 0.0, 0.0])).shape == (1,)
-    pg.train(resume=run, settings={"trials": 3}, cost=upright)
+    config = config_io.load(run / "config.yaml")
+    assert other_cost(run, tasks.of_config(replace(config, cost=upright))) is None  # type: ignore[arg-type]
+    capfd.readouterr()
+    pg.train(resume=run, settings={"trials": 3}, cost=half)
+    told = [line for line in capfd.readouterr().err.splitlines() if "today's cost" in line]
+    numbers = [float(found) for found in re.findall(r"(\d*\.\d+)", told[0])]
+    assert "costs of trials 1 to 2 were counted with another one" in told[0]
+    np.testing.assert_allclose(numbers, [np.mean(expected), np.mean(expected) / 2], rtol=1e-2)
     assert len(store.trials(run)) == 3
 
 

@@ -1,6 +1,7 @@
 """Line 3 of Alg. 1 as a job does it: the episodes of a trial, each durable before anything is learned from it."""
 
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
+from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,6 +11,7 @@ from pegasus_jax.checks import RunError
 from pegasus_jax.episode import Episode
 from pegasus_jax.experiment import COLLECT, trial_key
 from pegasus_jax.math.circles import to_observation
+from pegasus_jax.runs import store
 from pegasus_jax.runs.job import Job
 from pegasus_jax.runs.programs import gather, is_main_process
 from pegasus_jax.task import Task
@@ -77,12 +79,34 @@ def costed(job: Job, ran: Episode, trial: int) -> Episode:
     """
     x = np.asarray(ran.trajectory.x)
     task = job.experiment.task
-    cost = np.asarray(jax.vmap(task.cost.of_state)(episode.states(task, ran.trajectory)[1:]))
+    cost = costs_of(ran.trajectory, task)
     for (t,) in np.argwhere(~np.isfinite(cost))[:1]:
         seen = to_observation(x[t + 1], task.circles).tolist()
         found = f"the cost of the observation {seen} is {cost[t]}"
         job.writer.problem(f"trial {trial}: {found}; mend the cost")
     return ran._replace(trajectory=ran.trajectory._replace(cost=cost))
+
+
+def costs_of(trajectory: Trajectory, task: Task) -> np.ndarray:
+    """The cost of each control period of an episode, from what was observed."""
+    return np.asarray(jax.vmap(task.cost.of_state)(episode.states(task, trajectory)[1:]))
+
+
+def other_cost(run: Path, task: Task) -> str | None:
+    """What to say where an environment's newest episode costs something else today: its user has changed the cost."""
+    stored = store.numbered(run / "episodes", ".npz")
+    if task.environment is None or not stored:
+        return None
+    with suppress(RunError):  # of a damaged file whoever needs it tells
+        ran = store.load_episode(run, stored[-1])
+        if ran is not None and len(ran.trajectory.u):
+            before, now = ran.trajectory.cost, costs_of(ran.trajectory, task)
+            if np.isfinite(before).all() and not np.allclose(before, now, rtol=1e-3, atol=1e-4):
+                return (
+                    f"the episode of trial {stored[-1]} cost {np.mean(before):.3g} a step, and with today's cost"
+                    f" {np.mean(now):.3g}: the costs of trials 1 to {stored[-1]} were counted with another one"
+                )
+    return None
 
 
 def failed(ran: Episode, task: Task, advice: str = "", kept: bool = True) -> None:

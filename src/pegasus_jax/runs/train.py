@@ -24,7 +24,7 @@ from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.logs.read import Logged
 from pegasus_jax.runs import begin, checkpoint, config_io, logged, restore, store, tracked, writers
 from pegasus_jax.runs.beside import beside
-from pegasus_jax.runs.collect import collected, stacked
+from pegasus_jax.runs.collect import collected, other_cost, stacked
 from pegasus_jax.runs.display import learned
 from pegasus_jax.runs.evaluation import UNMEASURED, evaluate, kept_to, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
@@ -98,6 +98,8 @@ def train_seeds(
             logged.save(run, begun.episodes(), task)
         for run in folders if resume else ():
             restore.same(run, task)
+            if note := other_cost(run, task):
+                say(note)
         stored = restore.together(folders, job.experiment, say) if resume else None
         done = None if stored is None else int(stored.trial[0])
         states = first_states(job, stored, changed=(config.fit, config.search) != (before.fit, before.search))
