@@ -2,6 +2,7 @@
 
 import json
 import runpy
+from dataclasses import replace
 from functools import partial
 from inspect import signature
 
@@ -257,6 +258,19 @@ def test_starts_are_drawn_equally_likely_with_the_spread_of_the_task():
     np.testing.assert_allclose(on_plant[upright].std(0), [0.2] * 4, atol=0.05)
     np.testing.assert_allclose(task.start_mean, [0.5, 0, 0, 1.57], atol=1e-6)
     np.testing.assert_allclose(task.start_std, np.hypot([0.5, 0, 0, 1.57], 0.2), rtol=1e-6)
+
+
+def test_a_goal_is_drawn_apart_from_the_start():
+    """On the plant as in imagination, where one of a few starts is drawn with a spread around it."""
+    config = parse(task="cartpole", starts="[[0,0,0,0]]", goal_low="[-1]", goal_high="[1]")
+    task = build(replace(config, cost=lambda x, goal: jnp.abs(x[0] - goal[0]))).task  # type: ignore[arg-type]
+
+    def drawn(key):
+        x = starts.start(key, task=task)
+        return jnp.concatenate([x, memory.begin(task.memory, key, x)])
+
+    found = np.corrcoef(jax.vmap(drawn)(jax.random.split(jax.random.key(0), 500)).T)[-1, :-1]
+    assert np.abs(found).max() < 0.15
 
 
 # What is checked, and what a folder keeps

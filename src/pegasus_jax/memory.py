@@ -18,7 +18,8 @@ from pegasus_jax.types import NO_MEMORY, Array, Key, Memory, Trajectory
 
 __all__ = ["clock", "combined", "constant", "past_controls"]
 
-_START = 1  # what the key of an episode's start is folded with for its memory
+# What the key of an episode's start is folded with for its memory. It is not small: fold_in(key, 1) is split(key)[1].
+_START = 2**31 - 1
 
 
 def past_controls(names: tuple[str, ...], rest: Any, count: int, *, shown: bool) -> Memory:

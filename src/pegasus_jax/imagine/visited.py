@@ -19,7 +19,7 @@ from pegasus_jax.vectorized import Vectorized, for_particles
 
 STATES = 512  # that a posterior carries: as many for any number of trials, so that a search compiles once
 STEEPEST = 10.0  # docs/decisions.md 0038
-_VISITED = 1  # what the key of the start block is folded with
+_VISITED = 2**31 - 1  # what the key of the start block is folded with; fold_in(key, 1) is split(key)[1]
 
 
 class Visited(NamedTuple):
