@@ -346,6 +346,11 @@ def test_a_successor_takes_over_where_it_is_expected_to_cost_less(better, compar
     assert np.isnan(found.incumbent) == (compare == "always")
     if compare == "better":
         assert (float(jnp.mean(found.cost)) < float(found.incumbent)) == better
+        # One whose cost is not a number is no successor.
+        lost = state._replace(policy=state.policy._replace(params=new * jnp.nan))
+        after, found = jax.jit(exp.succeed)(lost, old)
+        assert not bool(found.replaced)
+        assert same(after.policy.params, old)
         # What has never learned anything is no incumbent.
         first, found = jax.jit(exp.succeed)(state._replace(policy_trial=jnp.int32(0)), old)
         assert (int(first.policy_trial), bool(found.replaced)) == (4, True)

@@ -36,7 +36,8 @@ from pegasus_jax.types import (
     Trajectory,
 )
 
-# What the key of a trial is folded with, so that no two draws share a key.
+# What the key of a trial is folded with, so that no two draws share a key. `init` has the first two of trial 0: no
+# episode runs in it, and only logs are fitted.
 COLLECT, FIT, SEARCH, IMAGINE, EVALUATE, RESTART, CALIBRATE = range(7)
 
 
@@ -248,7 +249,7 @@ def experiment(
         if expect is not None:
             old, new = (expect(key, params, posterior) for params in (incumbent, state.policy.params))
         unlearned = jnp.bool_(False) if begun else state.policy_trial == 0 if first_search else state.trial == 0
-        better = ~state.succeeded | ~(old <= new)
+        better = ~state.succeeded | (new < old) | jnp.isnan(old)
         if task.constraint is not None:
             better = limits.prefers(better, chance, old_chance, bound=task.constraint.bound)
         replaced = unlearned | better
