@@ -35,6 +35,20 @@ def log_normal_kl(params):
     return float(np.log(10) * len(mu) - np.sum(entropies))
 
 
+@pytest.mark.parametrize("value", [0.0, 0.3, -1e4])
+def test_an_input_that_has_never_varied_is_not_seen(value):
+    """A goal during the first episode, say: beside it nothing is known, and the next episode's is elsewhere."""
+    data = experience()
+    data = data._replace(x=data.x.at[:, 0].set(value))
+    model = network("none", True)
+    posterior = model.posterior(model.init(jax.random.key(0)), data)
+    x, u, draw = data.x[5], data.u[5], model.sample(jax.random.key(1), posterior)
+    here, there = (model.apply(posterior, draw, x.at[0].set(a), u) for a in (value, value + 2))
+    assert all(np.array_equal(a, b) for a, b in zip(here, there, strict=True))
+    moved = model.apply(posterior, draw, x.at[1].add(0.1), u)
+    assert not np.array_equal(here.mean, moved.mean)
+
+
 @pytest.mark.parametrize(
     ("kind", "heteroscedastic"),
     [("none", True), ("none", False), ("log_normal", True)],

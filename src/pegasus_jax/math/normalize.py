@@ -64,6 +64,12 @@ def independent(correlation: Array, least: float = 1e-4) -> Array:
     return jax.lax.fori_loop(0, correlation.shape[0], eliminate, start)[1]
 
 
+def varied(w: Whitener) -> Array:
+    """Whether each column [F] has varied, by more than rounding; the scale of one that has not is not known."""
+    rounding = 16 * jnp.finfo(w.root.dtype).eps * jnp.abs(w.mean)
+    return jnp.diagonal(w.root) > jnp.maximum(rounding, 1.01e-6)  # 1e-6: the floor of `whitener`
+
+
 def whiten(w: Whitener, rows: Array) -> Array:
     """White rows [..., F] of raw rows [..., F]."""
     return (rows - w.mean) @ w.inverse.T

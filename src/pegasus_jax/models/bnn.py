@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from pegasus_jax.math.angles import encode
-from pegasus_jax.math.normalize import Whitener, unwhiten, whitener
+from pegasus_jax.math.normalize import Whitener, unwhiten, varied, whitener
 from pegasus_jax.models.networks import HEADS, Head, Masks, nll, noisy
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 
@@ -53,7 +53,10 @@ def bnn(
         return jnp.concatenate([encode(x, angles), u], -1)
 
     def prepare(data: Dataset) -> Scaling:
-        return Scaling(whitener(inputs_of(data.x, data.u), data.size), whitener(data.y, data.size), data.size)
+        inputs = whitener(inputs_of(data.x, data.u), data.size)
+        # An input that has never varied is not seen: a start a little beside it would be thousands of units away.
+        inputs = inputs._replace(inverse=jnp.where(varied(inputs), inputs.inverse, 0))
+        return Scaling(inputs, whitener(data.y, data.size), data.size)
 
     def believe(params: Params, scaling: Scaling) -> Posterior:
         layers = dict(params["network"]["params"])

@@ -16,7 +16,7 @@ from jax.scipy.linalg import solve_triangular
 
 from pegasus_jax.math import gaussian
 from pegasus_jax.math.angles import encode
-from pegasus_jax.math.normalize import Whitener, whiten, whitener
+from pegasus_jax.math.normalize import Whitener, varied, whiten, whitener
 from pegasus_jax.types import Array, Dataset, Dynamics, Params
 
 
@@ -54,9 +54,7 @@ def rows_of(data: Dataset, angles: tuple[int, ...]) -> Rows:
     """The data set in scaled units. An input that has never varied is centered only: its scale is not known."""
     raw = inputs_of(data.x, data.u, angles)
     inputs, targets = (whitener(rows, data.size, full=False) for rows in (raw, data.y))
-    scale = jnp.diagonal(inputs.root)
-    rounding = 16 * jnp.finfo(raw.dtype).eps * jnp.abs(inputs.mean)
-    scale = jnp.where(scale <= jnp.maximum(rounding, 1.01e-6), 1, scale)  # 1e-6: the floor of `whitener`
+    scale = jnp.where(varied(inputs), jnp.diagonal(inputs.root), 1)
     inputs = Whitener(inputs.mean, jnp.diag(scale), jnp.diag(1 / scale))
     used = jnp.arange(raw.shape[0]) < data.size
     return Rows(
