@@ -288,8 +288,11 @@ def test_a_fresh_policy_that_a_table_needs_and_iterations_that_it_lacks_are_erro
     found, learner = on_table(search_table(2, init="fresh"), optax.sgd(0.1), STILL, rowless)
     with pytest.raises(ValueError, match="fresh= is None; expected its parameters"):
         found.run(jax.random.key(0), learner, 1.0, steps=1)
-    with pytest.raises(ValueError, match="steps=3: the table of this search has 2"):
-        found.run(jax.random.key(0), learner, 1.0, steps=3, fresh=jnp.zeros((2, 3)))
+    for first, steps in ((0, 3), (1, 2), (2, 1)):
+        with pytest.raises(
+            ValueError, match=f"first={first}, steps={steps}: the table of this search has 2 iterations"
+        ):
+            found.run(jax.random.key(0), learner, 1.0, first=first, steps=steps, fresh=jnp.zeros((2, 3)))
 
 
 @pytest.mark.parametrize(("init", "asks"), [("previous", False), ("better", True), ("fresh", True), ("raced", True)])

@@ -59,8 +59,9 @@ def search(
     a table that asks for them. Raises ValueError for more iterations than the table has, or no fresh policy.
     """
     table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)
-    if steps > (most := len(begin) - 1):
-        raise ValueError(f"steps={steps}: the table of this search has {most}")
+    known = int(first) if isinstance(first, int | np.integer) else 0
+    if known + steps > (most := len(begin) - 1):
+        raise ValueError(f"first={known}, steps={steps}: the table of this search has {most} iterations")
     if (asks := FRESH in table.candidate) and fresh is None:  # one that no row asks for is not drawn
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
     rows = of_search(table, earlier)
