@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pegasus_jax.assembly.schedules import rounds_from, width_for
-from pegasus_jax.imagine.objective import either
+from pegasus_jax.imagine.matching import either
 from pegasus_jax.learn.schedule import (
     COARSE,
     CURRENT,
@@ -46,6 +46,8 @@ def test_a_search_starts_from_the_policy_it_is_told():
     race = [(0, 0, STEP, FRESH), (1, 1, STEP, OTHER), (1, 2, EVALUATE, CURRENT), (1, 2, EVALUATE, LEADER)]
     end = [(3, 4, EVALUATE, CURRENT), (3, 4, EVALUATE, START)]
     assert visits(init="raced", refine=4) == [*race, *STEPS[2:], *end]
+    assert visits(init="raced", refine=3) == visits(init="better", refine=3)  # too short for a race
+    assert visits(init="raced") == visits(init="better")
     with pytest.raises(ValueError, match=r"init=old is not a choice; .*choices: previous, better, fresh, raced"):
         search_table(4, init="old")
 

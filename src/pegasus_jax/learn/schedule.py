@@ -53,7 +53,7 @@ def search_table(
     """The table of searches of `steps` iterations each.
 
     init: what a search starts from: the `previous` policy, a `fresh` one, the `better` of both, or of both after a race
-    of RACED of the iterations before `refine` each (`raced`); else a ConfigError.
+    of RACED of the iterations before `refine` each (`raced`; the `better` where that is none); else a ConfigError.
     refine: the iteration from which it refines the better of what it found and what it was given, or those with which
     rounds of that begin, each of which may be the last (learn/rounds.py); None: never.
     cost_width_start: the cost's width at the start; it falls to 1, geometrically, by half of the coarse iterations.
@@ -63,9 +63,10 @@ def search_table(
     under `warm_limit_factor` times the limit; with warm_restart=0 both stay as they are.
     """
     choice("init", init, INITS)
-    rows = [(0, 0, EVALUATE, CURRENT), (0, 0, EVALUATE, FRESH)] if init == "better" else []
     bounds = [] if refine is None else sorted({*np.atleast_1d(refine).tolist(), steps})
     heat = int(RACED * bounds[0]) if bounds and init == "raced" else 0
+    compares = init == "better" or (init == "raced" and not heat)
+    rows = [(0, 0, EVALUATE, CURRENT), (0, 0, EVALUATE, FRESH)] if compares else []
     for i in range(steps):
         begins = OTHER if heat and i == heat else FRESH if i == 0 and (heat or init == "fresh") else CURRENT
         rows += [(i, i, STEP, begins)]
