@@ -57,6 +57,16 @@ def test_the_gradient_goes_through_each_particle_of_a_wide_cloud_alone():
     assert np.array_equal(jacobian.reshape(2 * K, 2 * K), np.eye(2 * K))
 
 
+def test_a_particle_that_has_diverged_spoils_no_gradient():
+    x, z = cloud(0, 2.0)
+    far = x.at[3].set(1e25)
+    cost = Cost(lambda x: 1 - jnp.exp(-jnp.sum(x**2)))
+    moved = jax.grad(lambda x: jnp.sum(jnp.tanh(matching.narrow(ANGLES)(x, z))))(far)
+    costly = jax.grad(lambda x: jnp.sum(costs.of_narrow(cost, ANGLES)(x[None])))(far)
+    assert np.isfinite(moved).all()
+    assert np.isfinite(costly).all()
+
+
 def quadratic(x):
     return 0.01 * jnp.sum(x**2)
 

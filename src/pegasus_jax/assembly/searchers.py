@@ -14,7 +14,8 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs as cost
 from pegasus_jax.imagine import limits as limited
 from pegasus_jax.imagine import matching, scenarios
-from pegasus_jax.imagine.objective import either, objective
+from pegasus_jax.imagine.matching import either
+from pegasus_jax.imagine.objective import objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
 from pegasus_jax.imagine.visited import beside_visited, longest, started
 from pegasus_jax.learn.multistart import best_of
@@ -85,7 +86,7 @@ def search_of(
     noise = NoiseUse(search.policy_noise, search.state_noise, known)
     if isinstance(search, settings.Analytic):
         return analytic_search_of(search, task, dynamics, policy, noise)
-    matches = search.matching != "never" and task.memory.matched
+    matches = matching_of(search, task) not in (UNMATCHED, MATCHINGS["never"])
     states = len(task.state_names) + len(task.memory.names)
     if (matches or search.standardized_noise) and search.particles <= states:
         what = "moment matching" if matches else "standardized noise"

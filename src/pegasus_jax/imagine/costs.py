@@ -169,7 +169,12 @@ def of_matched(cost: Cost) -> Callable[[Array], Array]:
 def of_narrow(cost: Cost, angles: tuple[int, ...]) -> Callable[[Array], Array]:
     """`of_matched`, and at the times at which the particles are `matching.wide` the mean of their own costs."""
     own, matched = of_particles_mean(cost), of_matched(cost)
-    return lambda x: jnp.where(wide(x, angles)[:, None], own(x), matched(x))
+
+    def each(x: Array) -> Array:
+        far = wide(x, angles)[:, None]
+        return jnp.where(far, own(x), matched(jnp.where(far[..., None], 0, x)))  # as `either` does
+
+    return each
 
 
 def mean(costs: Array) -> Array:

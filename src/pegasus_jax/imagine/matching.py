@@ -38,7 +38,23 @@ def narrow(angles: tuple[int, ...]) -> Match:
     Particles all around a circle are no Gaussian: one of the same moments forgets which of them swings which way, and
     what a policy does to them averages out.
     """
-    return lambda x, z: jnp.where(wide(x, angles), x, match(x, z))
+    return lambda x, z: either(wide(x, angles), keep, match)(x, z)
+
+
+def either(condition: Array | None, yes: Callable[..., Array], no: Callable[..., Array]) -> Callable[..., Array]:
+    """The function that is `yes` where the condition holds and else `no`; without a condition, `no`.
+
+    Both are computed, because a branch at each time step costs a GPU more than they do. The one that is not asked for
+    gets zeros: what it would make of a particle that has diverged reaches no gradient.
+    """
+    if condition is None:
+        return no
+
+    def chosen(*arguments: Array) -> Array:
+        asked, other = ([jnp.where(c, a, 0) for a in arguments] for c in (condition, ~condition))
+        return jnp.where(condition, yes(*asked), no(*other))
+
+    return chosen
 
 
 def wide(x: Array, angles: tuple[int, ...]) -> Array:

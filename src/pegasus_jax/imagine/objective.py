@@ -35,19 +35,3 @@ def objective(
             " costs.of_particles(Cost(function)) makes that of a function of one state"
         )
     return aggregate(found)
-
-
-def either(condition: Array | None, yes: Callable[..., Array], no: Callable[..., Array]) -> Callable[..., Array]:
-    """The function that is `yes` where the condition holds and else `no`; without a condition, `no`.
-
-    Both are computed, because a branch at each time step costs a GPU more than they do. The one that is not asked for
-    gets zeros: what it would make of a particle that has diverged reaches no gradient.
-    """
-    if condition is None:
-        return no
-
-    def chosen(*arguments: Array) -> Array:
-        asked, other = ([jnp.where(c, a, 0) for a in arguments] for c in (condition, ~condition))
-        return jnp.where(condition, yes(*asked), no(*other))
-
-    return chosen
