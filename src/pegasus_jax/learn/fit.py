@@ -35,8 +35,8 @@ def fit(
     """`steps` updates of the model's parameters, each on `batch_size` rows of the [N, D] in use (Alg. 1 line 5).
 
     `optimizer` is any of optax, and `learner.optimizer` its state, `optimizer.init(params)`. A loss or a
-    gradient that is not finite changes neither. An optimizer that searches along a line gets the loss of the same rows and noise.
-    Raises ValueError for data of other shapes than a `Dataset` has.
+    gradient that is not finite changes neither. An optimizer that searches along a line gets the loss of the same rows
+    and noise. Raises ValueError for data of other shapes than a `Dataset` has.
     """
     check_data(data)
     context = prepare(data)
