@@ -178,6 +178,7 @@ words = lambda x: "far"
 push = lambda x: jnp.array([-x[0] - x[1]])
 three = lambda x: jnp.ones(3)
 numpys = lambda x: [float(-x[0])]
+degrees = lambda x: jnp.abs(x[3]) - 200.0
 nothing = lambda x: jnp.array([jnp.nan])
 """
 
@@ -209,6 +210,7 @@ def looked_at(**words: str) -> list[str]:
         ("root", "has a gradient of nan at x="),
         ("words", "TypeError"),
         ("nosuch", "has no nosuch"),
+        ("numpys", r"is not a JAX function: .* of x at limited_by.py:\d+; use jax.numpy"),
     ],
 )
 def test_a_constraint_that_cannot_be_kept_is_one_line(function: str, says: str, users: str) -> None:
@@ -220,8 +222,10 @@ def test_a_constraint_that_cannot_be_kept_is_one_line(function: str, says: str, 
 
 def test_a_constraint_is_looked_at_without_complaint_or_with_a_note(users: str) -> None:
     assert looked_at(constraint=f"{users}:rail") == looked_at(constraint=f"{users}:both") == []
-    (note,) = looked_at(constraint=f"{users}:never")
-    assert "is positive at none of" in note
+    for function in ("never", "degrees"):  # the angle is one: 200 rad are too many turns
+        (note,) = looked_at(constraint=f"{users}:{function}")
+        assert "is positive at none of" in note
+        assert "Angles are in radians" in note
 
 
 @pytest.mark.parametrize(
@@ -233,7 +237,7 @@ def test_a_constraint_is_looked_at_without_complaint_or_with_a_note(users: str) 
         ({"explore__amplitude": "0"}, "explore.amplitude=0 is out of range"),
         ({"explore__policy": "limited_by:three"}, r"returns an array of shape \(3,\); expected \(1,\)"),
         ({"explore__policy": "limited_by:nothing"}, r"is \[nan\] at the start"),
-        ({"explore__policy": "limited_by:numpys"}, "ConcretizationTypeError"),
+        ({"explore__policy": "limited_by:numpys"}, "is not a JAX function"),
         ({"explore__policy": "runs/none"}, "neither a run's folder nor a function"),
     ],
 )

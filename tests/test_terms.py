@@ -18,7 +18,7 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.exports.drive import drives
 from pegasus_jax.exports.write import FORMATS, export
 from pegasus_jax.imagine import costs
-from pegasus_jax.runs import config_io, facts
+from pegasus_jax.runs import check, config_io, facts
 from pegasus_jax.runs.check import before_training
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.runs.restore import restored
@@ -30,6 +30,14 @@ from probes import cart, tiny
 
 def parse(**words):
     return config_io.parse(words)
+
+
+LATE = {
+    "task": "cartpole",
+    "sensors.measured": "[0,3]",
+    "sensors.velocity": "difference",
+    "sensors.delay": "3",
+}
 
 
 def price(x, u, previous_u, t, reference, goal):
@@ -274,6 +282,31 @@ def test_a_goal_is_drawn_apart_from_the_start():
 
 
 # What is checked, and what a folder keeps
+
+
+def test_a_check_says_what_sensors_goals_and_a_constraint_make_of_a_task():
+    words = dict(task="cartpole", goal_low="[-1]", goal_high="[0.5]")
+    config = replace(parse(**words), cost=lambda x, goal: jnp.abs(x[0] - goal[0]), constraint=lambda x: x[0] - 3)
+    said = check.understood(config, build(config).task)
+    assert said["policy sees"].endswith(", goal 0")
+    assert said["goals"] == "from [-1] to [0.5]"
+    assert "broken by at most 0.05 of the episodes" in said["constraint"]
+    late = parse(**LATE)
+    assert "measured rate of" in check.understood(late, build(late).task)["policy sees"]
+    assert check.understood(parse(task="cartpole"), tasks.make("cartpole")) == {}
+
+
+def test_a_note_on_a_large_cost_is_of_controls_within_their_limits_and_short():
+    """Of two periods late, of which the check knows that they are controls too."""
+    config = replace(parse(**LATE), cost=lambda x: 2 - jnp.exp(-(x[0] ** 2)))
+    task = build(config).task
+    _, _, low, high = terms.box(task)
+    late = [i for i, name in enumerate(task.memory.names) if name.startswith("force")]
+    assert len(late) >= 4
+    assert (low[late] == -10).all()
+    assert (high[late] == 10).all()
+    (note,) = (line for line in before_training(config, task) if "more than 1" in line)
+    assert len(note) < 400
 
 
 def test_a_cost_is_checked_with_all_that_it_takes():

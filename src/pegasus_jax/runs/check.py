@@ -13,11 +13,12 @@ from pegasus_jax.config import Config, Search
 from pegasus_jax.imagine import costs
 from pegasus_jax.math.circles import entries
 from pegasus_jax.math.units import parted
+from pegasus_jax.memory import seen_names
 from pegasus_jax.policies.rate_limited import largest_change
 from pegasus_jax.runs import begin, first
 from pegasus_jax.runs.logged import read_config
 from pegasus_jax.task import Task
-from pegasus_jax.tasks import assumed, constrained, cost_check, guide, user_code
+from pegasus_jax.tasks import assumed, constrained, cost_check, guide, signals, user_code
 
 RESETS = 20  # of an environment that may be reset without need
 EXACT = 1e-4  # of an entry's spread: what is left of it is rounding
@@ -189,6 +190,7 @@ def report(config: Config) -> list[str]:
         "task": " ".join([config.task, *([task.name] if task.name != config.task else [])]),
         **tasks.described(config),
         "observation": ", ".join(task.state_names),
+        **understood(config, task),
         "angles": ", ".join(task.state_names[i] for i in task.angles) or "none",
         "control": ", ".join(
             f"{name} from {low:g} to {high:g}"
@@ -206,6 +208,22 @@ def report(config: Config) -> list[str]:
     verdict = "no error" + ("; the notes may matter" if notes else "")
     lines = [*facts.items(), *(("note", note) for note in notes), ("found", verdict)]
     return [f"{name:>12}  {value}" for name, value in lines]
+
+
+def understood(config: Config, task: Task) -> dict[str, str]:
+    """What the words of sensors, goals and a constraint have made of a task: nothing of what nobody asked for."""
+    found = {}
+    if (seen := seen_names(task)) != task.state_names:
+        found["policy sees"] = ", ".join(seen)
+    if task.goal is not None:
+        drawn = signals.draws(task.goal.value)
+        low, high = (config.goal_low, config.goal_high) if config.goal_low else (drawn.min(0), drawn.max(0))
+        found["goals"] = f"from {_numbers(low)} to {_numbers(high)}"
+    if task.constraint is not None:
+        found["constraint"] = (
+            f"{shown(config.constraint)}, broken by at most {task.constraint.bound:.3g} of the episodes"
+        )
+    return found
 
 
 def width(config: Config, begun: np.ndarray) -> float:

@@ -1,26 +1,47 @@
-"""What a Gymnasium environment, and the user, left unsaid, and what is taken for it: notes, one line each."""
+"""What a user's plant, and the user, left unsaid, and what is taken for it: notes, one line each."""
 
 from contextlib import suppress
+from pathlib import Path
 
 import numpy as np
 
-from pegasus_jax.config import GYM, Config
+from pegasus_jax.config import GYM, MJCF, Config
 
 
 def notes(given: Config) -> list[str]:
-    """Notes on a config as it was `given`, whose environment is open: its period, and its episodes that only measure.
+    """Notes on a config as it was `given`: an environment's period, and its episodes that only measure; quaternions.
 
-    Nothing tells a default from the same number said by the user, so the latter is told what it means too.
+    An environment is open. Nothing tells a default from the same number said by the user, so the latter is told what it
+    means too.
     """
+    if given.task == MJCF:
+        return rotations(given)
     if given.task != GYM:
         return []
     told = period(given)
+    if not given.eval_episodes and (given.goals or given.goal_low):
+        told.append(
+            "eval_episodes=0, and each episode has another goal: their costs do not compare policies;"
+            " pegasus-eval RUN episodes=20 does"
+        )
     if given.eval_episodes == Config.eval_episodes:
         told.append(
             f"after each trial the environment runs {given.eval_episodes} more episodes, which only measure the policy"
             " and are not learned from; eval_episodes=0 leaves them out"
         )
     return told
+
+
+def rotations(given: Config) -> list[str]:
+    """Notes on orientations of an MJCF file's bodies that are observed as quaternions, one each joint."""
+    from pegasus_envs import mjcf_plant
+
+    found = mjcf_plant.orientations(mjcf_plant.read(Path(given.mjcf or "")), given.observe)
+    return [
+        f"{joint}: {', '.join(entries)} are of a quaternion, which is learned as plain numbers, so that with noise it"
+        " is not quite a rotation; hinges have angles, and observe= can leave it out"
+        for joint, entries in found.items()
+    ]
 
 
 def period(given: Config) -> list[str]:

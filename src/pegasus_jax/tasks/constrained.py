@@ -12,6 +12,8 @@ from pegasus_jax.task import Task
 from pegasus_jax.tasks import cost_check, user_code
 from pegasus_jax.types import Array
 
+TURNS = 10  # [rad] an angle is looked at no further away than this
+
 
 def of_config(config: Config, task: Task) -> Constraint | None:
     """The constraint that a config names, in units of how far the starts are from its limits; None where it has none.
@@ -54,8 +56,13 @@ def notes(constraint: Constraint | None, facts: cost_check.Facts, what: str) -> 
     """
     if constraint is None:
         return []
-    axes = np.eye(len(facts.start_mean))
-    away = [sign * size * axis for axis in axes for size in (0.1, 1, 10, 100, 1000) for sign in (1, -1)]
+    away = [
+        sign * size * axis
+        for entry, axis in enumerate(np.eye(len(facts.start_mean)))
+        for size in (0.1, 1, 10, 100, 1000)
+        if size <= TURNS or entry not in facts.angles
+        for sign in (1, -1)
+    ]
     near = cost_check.probes(facts)
     numbers, slopes = _evaluated(constraint, np.concatenate([near, np.array(away) + facts.start_mean]), what)
     for kind, found in (("", numbers), ("gradient ", slopes.reshape(len(slopes), -1))):
@@ -68,7 +75,8 @@ def notes(constraint: Constraint | None, facts: cost_check.Facts, what: str) -> 
             " follow; return how far x is beyond the limit, as jnp.abs(x[0]) - 1.5, not whether it is"
         )
     never = np.flatnonzero(~(np.nan_to_num(numbers) > 0).any(0))
-    return [f"{what} is positive at none of {len(numbers)} points in its number {c}: is its sign right?" for c in never]
+    where = f"positive at none of {len(numbers)} points"
+    return [f"{what} is {where} in its number {c}: is its sign right? Angles are in radians" for c in never]
 
 
 def _evaluated(constraint: Constraint, points: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:

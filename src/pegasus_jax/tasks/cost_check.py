@@ -11,7 +11,7 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.math.circles import Circles, to_observation
 from pegasus_jax.task import Task
 from pegasus_jax.tasks.terms import box
-from pegasus_jax.tasks.user_code import blamed, definition, line_of, place_of
+from pegasus_jax.tasks.user_code import blamed, definition, place_of
 
 UNBOUNDED = 1e6  # limits of an observation beyond this are none
 AROUND = 100  # random points
@@ -73,7 +73,7 @@ def notes(
     found = []
     if values[most] > 1 + 1e-3:
         found.append(
-            f"{what} is {values[most]:.3g} at {_text(points[most], facts)}, more than 1: success then means an episode"
+            f"{what} is {values[most]:.4g} at {_text(points[most], facts)}, more than 1: success then means an episode"
             f" whose last five steps cost less than success={facts.success:g} on average; 1 - jnp.exp(-cost) is below 1"
         )
     flat = (change := np.ptp(_around(cost, facts))) < FLAT < values[0]
@@ -153,16 +153,8 @@ def _traced(cost: Callable[[Any], Any], facts: Facts, what: str) -> None:
         _number(value, cost, what)
         return jnp.asarray(value)
 
-    try:
-        with blamed(what, cost):
-            traced = jax.make_jaxpr(one)(jax.ShapeDtypeStruct((size,), jnp.zeros(()).dtype))
-    except ConfigError as error:
-        if isinstance(error.__cause__, jax.errors.JAXTypeError):
-            raise ConfigError(
-                f"{what} is not a JAX function: it makes a Python number or a NumPy array of x"
-                f"{_in(line_of(error.__cause__) or definition(cost))}; use jax.numpy, and jnp.where instead of if"
-            ) from error
-        raise
+    with blamed(what, cost):
+        traced = jax.make_jaxpr(one)(jax.ShapeDtypeStruct((size,), jnp.zeros(()).dtype))
     for index, length, line in beyond(traced):
         raise ConfigError(
             f"{what} reads entry {index} of an array of {length}{_in(line)}; x has {observed}, 0 to {observed - 1}, and"
@@ -271,5 +263,6 @@ def _in(place: str | None) -> str:
 def _text(state: np.ndarray, facts: Facts) -> str:
     states = len(state) - len(facts.remembered)
     x = to_observation(state[:states], facts.circles)
-    others = "".join(f", {name}={v:.3g}" for name, v in zip(facts.remembered, state[states:], strict=True))
-    return f"x=[{', '.join(f'{v:.3g}' for v in x[:6])}{', ...' if len(x) > 6 else ''}]{others}"
+    others = [f", {name}={v:.3g}" for name, v in zip(facts.remembered, state[states:], strict=True)]
+    more = "".join(others[:4]) + (", ..." if len(others) > 4 else "")
+    return f"x=[{', '.join(f'{v:.3g}' for v in x[:6])}{', ...' if len(x) > 6 else ''}]{more}"

@@ -179,7 +179,7 @@ def box(task: Task) -> np.ndarray:
     """Mean, standard deviation, least and greatest value [4, M] of what a task remembers, as far as a cost takes it."""
     low, high = np.asarray(task.control_low, float), np.asarray(task.control_high, float)
     known = {CLOCK: (0.0, task.horizon * task.dt)}
-    for before in (1, 2):
+    for before in range(1, len(task.memory.names) + 1):
         known |= dict(zip(past(task, before), zip(low, high, strict=True), strict=True))
     if task.goal is not None:
         seen = draws(task.goal.value)

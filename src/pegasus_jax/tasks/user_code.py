@@ -113,6 +113,12 @@ def blamed(what: str, function: Any = None, imports: bool = False) -> Iterator[N
     except (KeyboardInterrupt, ConfigError):
         raise
     except BaseException as error:
+        if any(kind.__name__ == "JAXTypeError" for kind in type(error).__mro__):  # JAX need not be imported for that
+            place = line_of(error) or definition(function)
+            raise ConfigError(
+                f"{what} is not a JAX function: it makes a Python number or a NumPy array of x"
+                f"{f' at {place}' if place else ''}; use jax.numpy, and jnp.where instead of if"
+            ) from error
         middle = " cannot be imported" if imports and isinstance(error, ImportError) else ""
         raise ConfigError(f"{what}{middle}: {told(error, function)}") from error
 
