@@ -270,6 +270,8 @@ def test_a_beginning_that_does_not_suit_is_one_line(words, part, simulator):
         ),
         (dict(init="RUN", history="2", search__particles="12"), "; that run has history=1: say the same in both"),
         (dict(prior="nowhere.xml", model="log_normal"), "there is no such file"),
+        (dict(prior="arm.xm", model="log_normal"), "prior=arm.xm is no simulator: expected module:function, as sim"),
+        (dict(observe="[qpos.0]"), "observe=[qpos.0] is of an MJCF file: it needs task=mjcf, or prior=FILE.xml"),
         (dict(init="RUN"), ""),
     ],
 )

@@ -270,7 +270,9 @@ class Config:
     control_rate: tuple[float, ...] = setting(
         (), "largest rate of change of a control [its unit per s], one for all or one each; []: any", EVERY
     )
-    observe: tuple[str, ...] = setting((), "as [qpos.0,qvel.1]; []: all positions, then all velocities", (MJCF,))
+    observe: tuple[str, ...] = setting(
+        (), "of a file, as [qpos.0,qvel.1]; []: all positions, then all velocities", EVERY
+    )
     control_low: tuple[float, ...] = setting((), "least controls; []: the action space's, the file's ctrlrange", OWN)
     control_high: tuple[float, ...] = setting(
         (), "greatest controls; []: the action space's, the file's ctrlrange", OWN

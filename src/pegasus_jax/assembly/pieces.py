@@ -64,7 +64,7 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
     if task.prior is not None and (task.hindsight is not None or controls != len(task.control_names)):
         raise ConfigError(
             "prior= is a step from a whole state, and history= or sensors.velocity= stand for one that is not measured;"
-            " the nearest is without prior="
+            " leave out prior=, and begin with a run of the simulator instead: init=RUN"
         )
     told = states if task.prior is not None else 0  # what a `residual` is told beside the controls
     shape: dict[str, Any] = dict(states=states, controls=controls + told, angles=task.angles)

@@ -1,5 +1,6 @@
 """The simulator that `prior=` names, as a function of state and control: one of the user's, or an MJCF file's."""
 
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -7,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from pegasus_jax.checks import ConfigError, shown
-from pegasus_jax.config import Config
+from pegasus_jax.config import MJCF, Config
 from pegasus_jax.math import circles
 from pegasus_jax.models.residual import Simulate
 from pegasus_jax.task import Task
@@ -19,12 +20,21 @@ FILE = ".xml"
 
 def of_config(config: Config, task: Task) -> Simulate | None:
     """The config's prior, or None. Raises ConfigError, in one line, for one that does not suit the task."""
-    if config.prior is None:
+    what, prior = f"prior={shown(config.prior)}", config.prior
+    of_a_file = isinstance(prior, str) and prior.endswith(FILE)
+    if config.observe and config.task != MJCF and not of_a_file:
+        raise ConfigError(f"observe={shown(config.observe)} is of an MJCF file: it needs task=mjcf, or prior=FILE.xml")
+    if prior is None:
         return None
-    what = f"prior={shown(config.prior)}"
-    if isinstance(config.prior, str) and config.prior.endswith(FILE):
+    if of_a_file:
         return checked(what, of_file(what, config, task), task)
-    function = user_code.load("prior", config.prior or "")
+    if isinstance(prior, str) and ":" not in prior:
+        near = get_close_matches(prior, [path.name for path in Path().glob(f"*{FILE}")], n=1)
+        raise ConfigError(
+            f"{what} is no simulator: expected module:function, as simulator:step, or an MJCF file, whose name ends in"
+            f" {FILE}" + (f"; did you mean prior={near[0]}?" if near else "")
+        )
+    function = user_code.load("prior", prior)
 
     def simulate(x: Array, u: Array) -> Array:
         return circles.to_state(function(circles.to_observation(x, task.circles), u), task.circles)
