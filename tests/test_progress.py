@@ -99,6 +99,15 @@ def test_a_trial_that_is_not_the_best_says_which_is() -> None:
     assert ["best so far: trial 1" in line for line in text.getvalue().splitlines()] == [False, True]
 
 
+def test_a_policy_that_a_run_began_with_may_be_the_best() -> None:
+    text = io.StringIO()
+    display = Display(9, Console(file=text, width=400))
+    own = ROW | {"mean_cost": None, "success_rate": None, "random": False}
+    display.trial([own | {"trial": 1, "policy": 0, "episode_cost": 0.2}])
+    display.trial([own | {"trial": 2, "policy": 1, "episode_cost": 0.4}])
+    assert "best so far: trial 0" in text.getvalue().splitlines()[-1]
+
+
 def test_a_trial_that_is_still_evaluated_has_its_line_before_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(progress, "BRIEF", 0.1)
     text = io.StringIO()

@@ -67,7 +67,7 @@ def spark(values: Sequence[Any], blocks: str = BLOCKS) -> str:
 def best(trials: Sequence[Rows]) -> int | None:
     """The trial with the best policy of a single seed so far; None where rows of an earlier version do not tell."""
     try:
-        return store.best_trial([rows[0] for rows in trials])
+        return store.best_trial([rows[0] for rows in trials], first=0)
     except (KeyError, TypeError):
         return None
 
