@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import jax
@@ -13,12 +14,15 @@ import mujoco
 import numpy as np
 import pytest
 
+import pegasus_jax as pg
 from pegasus_envs import mjcf_check, mjcf_plant
 from pegasus_envs.render import frames
 from pegasus_jax import tasks
+from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config, label
-from pegasus_jax.runs import config_io, store
+from pegasus_jax.runs import check, config_io, store
+from pegasus_jax.tasks import assumed
 
 TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
 PENDULUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "inverted_pendulum.xml"
@@ -142,18 +146,33 @@ def test_folders_tell_tasks_apart() -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"mjcf": None}, "needs mjcf=, cost=, dt= and horizon="),
-        ({"dt": None}, "needs mjcf=, cost=, dt= and horizon="),
+        ({"mjcf": None}, "task=mjcf needs mjcf=; for example mjcf=arm.xml"),
+        ({"dt": None, "horizon": None}, "task=mjcf needs dt= and horizon=; for example dt=0.05 horizon=40"),
+        ({"mjcf": None, "cost": None, "dt": None}, "needs mjcf=, cost= and dt=; for example mjcf=arm.xml cost=my"),
         ({"mjcf": "nowhere.xml"}, "there is no such file"),
         ({"dt": 0.05}, "not a whole number of its time steps of 0.02 s; try 0.04"),
-        ({"observe": ("qpos.2",)}, "choose from qpos.0 to qpos.1 or qvel.0 to qvel.1"),
-        ({"observe": ("tip",)}, "choose from qpos.0"),
+        ({"observe": ("qpos.2",)}, "choose from qpos.0 slider, qpos.1 hinge or, as rates, qvel.0 to qvel.1"),
+        (
+            {"observe": ("hinge",)},
+            "observe=hinge is not an entry of its state; choose from qpos.0 slider, qpos.1 hinge",
+        ),
         ({"control_low": (1.0, 2.0)}, "control_low has 2 entries; expected 1"),
         ({"control_low": (5.0,)}, "control_low=5 must be less than control_high=3"),
+        ({"control_low": (-4.0,)}, "actuator slide: controls from -4 to 3 are not among its own, from -3 to 3"),
+        ({"control_high": (3.5,)}, "actuator slide: controls from -3 to 3.5 are not among its own, from -3 to 3"),
         ({"dt": 2000.0}, "dt=2000 is 100000 of its time steps; the most is dt=200"),
         ({"start_mean": (0.1,)}, "start_mean has 1 entries; expected 4"),
         ({"start_mean": (1.0, 2.0)}, "start_mean has 2 entries; expected 4"),
-        ({"angles": (4,)}, "choose from 0 to 3"),
+        ({"angles": (4,)}, "angles=4 is not an entry of the observation"),
+        (
+            {"angles": (1, 0)},
+            "angles=0 is slider [m], and only positions of hinges are angles; choose from 1 hinge [rad]",
+        ),
+        ({"angles": (3,)}, "angles=3 is hinge' [rad/s], and only positions of hinges are angles; choose from 1 hinge"),
+        (
+            {"angles": (0,), "observe": ("qpos.0",)},
+            "angles=0 is slider [m], and only positions of hinges are angles; leave",
+        ),
         ({"cost": "math:nothing"}, "cost=math:nothing cannot be imported"),
     ],
 )
@@ -234,3 +253,146 @@ def test_a_simulation_that_breaks_down_is_not_learned_from(tmp_path: Path, monke
     with pytest.raises(ValueError, match=r"not stable: it breaks down in period \d+ of"):
         mjcf_check.compare(arm(tmp_path / "arm.xml", motor=motor, density='0" timestep="0.02'))
     assert not Path("MUJOCO_LOG.TXT").exists()
+
+
+TWO = """<mujoco><option timestep="0.02"/><worldbody><body>{first}<geom type="box" size=".1 .1 .3"/><body pos="0 0 .3">
+<joint name="wheel" axis="0 1 0" damping=".1"/><geom type="box" size=".1 .1 .3"/></body></body></worldbody>
+<actuator>{motors}</actuator></mujoco>"""
+FIRST = {
+    "hinge": '<joint name="base" axis="0 1 0"/>',
+    "free": '<freejoint name="root"/>',
+    "ball": '<joint name="neck" type="ball"/>',
+}
+LIMITED = '<motor name="spin" joint="wheel" ctrllimited="true" ctrlrange="-1 1"/>'
+UNLIMITED = '<motor name="pull" joint="wheel"/>'
+
+
+def two(path: Path, first: str, motors: str = LIMITED) -> Path:
+    """A file of two joints, of which the second is a hinge."""
+    path.write_text(TWO.format(first=FIRST[first], motors=motors))
+    return path
+
+
+def test_limits_are_asked_for_where_the_file_has_none_and_one_list_is_as_long_as_the_other(tmp_path: Path) -> None:
+    path = two(tmp_path / "two.xml", "hinge", LIMITED + UNLIMITED)
+    given = tasks.of_config(config(path, control_low=(-1.0, -9.0), control_high=(0.5, 9.0)))
+    np.testing.assert_allclose((given.control_low, given.control_high), ([-1, -9], [0.5, 9]))
+    one = tasks.of_config(config(path, control_low=(-0.5,), control_high=(0.5,)))
+    np.testing.assert_allclose((one.control_low, one.control_high), ([-0.5] * 2, [0.5] * 2))
+    with pytest.raises(ConfigError, match="actuator pull has no ctrlrange"):
+        tasks.of_config(config(path))
+    with pytest.raises(ConfigError, match="actuator spin: controls from -9 to 9 are not among its own, from -1 to 1"):
+        tasks.of_config(config(path, control_low=(-9.0,), control_high=(9.0,)))
+    prior = mjcf_plant.mechanism(mjcf_plant.read(path), 0.04, control_low=[-9.0], control_high=[9.0])  # has the task's
+    np.testing.assert_allclose((prior.control_low, prior.control_high), ([-9] * 2, [9] * 2))
+    for low, high in (((-1.0,), (1.0, 1.0)), ((-1.0, -1.0), (1.0,))):
+        told = (
+            rf"control_low has {len(low)} and control_high has {len(high)} numbers; expected 2 in both, or one for all"
+        )
+        with pytest.raises(ConfigError, match=told):
+            tasks.of_config(config(path, control_low=low, control_high=high))
+
+
+def test_a_range_that_is_switched_off_limits_nothing(tmp_path: Path) -> None:
+    path = two(tmp_path / "two.xml", "hinge")
+    path.write_text(path.read_text().replace("/>", '><flag clampctrl="disable"/></option>', 1))
+    given = tasks.of_config(config(path, control_low=(-9.0,), control_high=(9.0,)))
+    np.testing.assert_allclose((given.control_low, given.control_high), ([-9], [9]))
+
+
+@pytest.mark.parametrize(
+    ("first", "of", "others", "angle", "choices"),
+    [
+        (
+            "free",
+            "root, a free joint: ",
+            (3, 7),
+            7,
+            "qpos.0 to qpos.6 root, qpos.7 wheel, qvel.0 to qvel.5 root, qvel.6",
+        ),
+        (
+            "ball",
+            "neck, a ball joint: ",
+            (0, 4),
+            4,
+            "qpos.0 to qpos.3 neck, qpos.4 wheel, qvel.0 to qvel.2 neck, qvel.3",
+        ),
+    ],
+)
+def test_a_quaternion_is_no_angle_and_is_told(
+    first: str, of: str, others: tuple[int, int], angle: int, choices: str, tmp_path: Path
+) -> None:
+    path = two(tmp_path / "two.xml", first)
+    (note,) = assumed.notes(config(path))
+    assert note.startswith(
+        f"{of}{', '.join(f'qpos.{i}' for i in range(*others))} are of a quaternion, which is learned"
+    )
+    assert assumed.notes(config(path, observe=(f"qpos.{angle}", f"qvel.{angle - 1}"))) == []
+    assert tasks.of_config(config(path, angles=(angle,))).angles == (angle,)
+    with pytest.raises(ConfigError, match=rf"angles=0 is qpos.0, and only .*; choose from {angle} wheel \[rad\]$"):
+        tasks.of_config(config(path, angles=(0,)))
+    with pytest.raises(ConfigError, match=choices):
+        tasks.of_config(config(path, observe=("wheel",)))
+    assert assumed.notes(config(two(path, "hinge"))) == []
+
+
+def test_of_many_joints_the_first_and_the_last_are_told(tmp_path: Path) -> None:
+    path, more = tmp_path / "many.xml", '<joint name="{}" axis="0 1 0"/>'
+    names = [f"j{i}" for i in range(13)]
+    body = "".join(f'<body>{more.format(name)}<geom size=".1"/>' for name in names) + "</body>" * len(names)
+    path.write_text(
+        f"<mujoco><worldbody>{body}</worldbody><actuator>{LIMITED.replace('wheel', 'j0')}</actuator></mujoco>"
+    )
+    model = mjcf_plant.read(path)
+    with pytest.raises(ValueError, match=r"choose from qpos\.0 to qpos\.12 or qvel\.0 to qvel\.12$"):
+        mjcf_plant.mechanism(model, 0.02, observe=["tip"])
+
+
+SENSORS: dict[str, dict[str, Any]] = {
+    "late": {"sensors.delay": 2},
+    "difference": {"sensors.measured": [0], "sensors.velocity": "difference"},
+    "filter": {"sensors.measured": [0], "sensors.velocity": "filter", "sensors.delay": 1},
+    "history": {"sensors.measured": [0], "history": 2, "sensors.delay": 1},
+    "slow": {"control_rate": [5.0], "sensors.delay": 1},
+    "starts": {"starts": [[0.3, 0.0], [-0.3, 0.0]], "sensors.delay": 1},
+    "goals": {"goal_low": [-1.0], "goal_high": [1.0], "sensors.delay": 1},
+}
+
+
+def turned(x: jax.Array) -> jax.Array:
+    return 1 - jnp.exp(-((x[0] - 1) ** 2))
+
+
+def turned_to(x: jax.Array, goal: jax.Array) -> jax.Array:
+    return 1 - jnp.exp(-((x[0] - goal[0]) ** 2))
+
+
+def settings(folder: Path, sensors: str) -> dict[str, Any]:
+    """Of an arm with these sensors."""
+    (folder / "arm.xml").write_text(ARM.format(density="1000", geom="", motor=MOTOR))
+    plant = {"mjcf": str(folder / "arm.xml"), "dt": 0.04, "horizon": 5, "angles": [0]}
+    return plant | {"cost": turned_to if sensors == "goals" else turned} | SENSORS[sensors]
+
+
+@pytest.mark.parametrize("sensors", SENSORS)
+def test_the_check_compares_the_plant_behind_any_sensors(sensors: str, tmp_path: Path) -> None:
+    made = pg.preset("mjcf", settings=settings(tmp_path, sensors))
+    check.before_training(made, build(made).task)
+
+
+def test_another_physics_is_seen_behind_a_delay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = pg.preset("mjcf", settings=settings(tmp_path, "late"))
+    task = tasks.of_config(made)
+    monkeypatch.setattr(mjcf_check, "TOLERANCE", -1.0)
+    with pytest.raises(ConfigError, match="MJX does not simulate it as MuJoCo does"):
+        tasks.compared(made, task)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensors", ["filter", "goals"])
+def test_an_arm_learns_behind_any_sensors(sensors: str, tmp_path: Path) -> None:
+    tiny = {"model.hidden": [4], "policy.hidden": [4], "search.particles": 16, "search.steps": 2, "fit.steps": 3}
+    words = settings(tmp_path, sensors) | tiny | {"trials": 2, "eval_episodes": 1}
+    run = pg.train("mjcf", out=tmp_path / "run", settings=words)
+    assert [row["random"] for row in store.trials(run)] == [True, False]
+    assert all(np.isfinite(row["episode_cost"]) for row in store.trials(run))

@@ -22,6 +22,7 @@ _ENTRY = re.compile(r"(qpos|qvel)\.(\d+)")
 LONGEST = 10_000  # time steps of a control period
 # Flags that only ask for numbers that nobody here reads; MJX refuses them.
 _HARMLESS = int(mujoco.mjtEnableBit.mjENBL_ENERGY) | int(mujoco.mjtEnableBit.mjENBL_FWDINV)
+NAMED = 12  # joints, or entries, of which a message names each; of more it says the first and the last
 _UNITS = {int(mujoco.mjtJoint.mjJNT_HINGE): "rad", int(mujoco.mjtJoint.mjJNT_SLIDE): "m"}
 
 
@@ -59,6 +60,8 @@ class Mechanism(NamedTuple):
     model: Any
     qpos: Callable[[Moving], Array]
     rates: tuple[int, ...]
+    hinges: tuple[int, ...]
+    """the observed entries that are positions of hinges [rad]"""
 
 
 def mechanism(
@@ -130,6 +133,7 @@ def mechanism(
         model=model,
         qpos=lambda state: state.qpos,
         rates=_rates(model, entries),
+        hinges=tuple(map(int, np.flatnonzero(np.isin(entries, _hinges(model))))),
     )
     try:
         jax.eval_shape(made.step, jax.eval_shape(made.reset, jax.random.key(0)), jnp.zeros(model.nu))
@@ -188,10 +192,54 @@ def _entries(model: mujoco.MjModel, observe: Sequence[str]) -> np.ndarray:
     for word in observe:
         match = _ENTRY.fullmatch(word)
         if not match or int(match[2]) >= sizes[match[1]]:
-            choices = f"qpos.0 to qpos.{model.nq - 1} or qvel.0 to qvel.{model.nv - 1}"
-            raise ValueError(f"observe={word} is not an entry of its state; choose from {choices}")
+            raise ValueError(f"observe={word} is not an entry of its state; choose from {_choices(model)}")
         found.append(int(match[2]) + (model.nq if match[1] == "qvel" else 0))
     return np.array(found, int) if found else np.arange(model.nq + model.nv)
+
+
+def _choices(model: mujoco.MjModel) -> str:
+    """The entries of a state, each with its joint, unless there are many."""
+    rates = _span("qvel", 0, model.nv)
+    if model.njnt > NAMED:
+        return f"{_span('qpos', 0, model.nq)} or {rates}"
+    positions = _of_joints("qpos", model.jnt_qposadr, model.nq, model)
+    if model.nq != model.nv:  # a free joint or a ball: the numbers of velocities are others
+        return f"{positions}, {_of_joints('qvel', model.jnt_dofadr, model.nv, model)}"
+    return f"{positions} or, as rates, {rates}"
+
+
+def _of_joints(word: str, first: np.ndarray, size: int, model: mujoco.MjModel) -> str:
+    """As "qpos.0 to qpos.6 root, qpos.7 knee": the entries of each joint, of which these are the first."""
+    ends = [*map(int, first[1:]), size]
+    spans = [_span(word, start, end) for start, end in zip(map(int, first), ends, strict=True)]
+    return ", ".join(f"{span} {_joint(model, i)}" for i, span in enumerate(spans))
+
+
+def _span(word: str, start: int, end: int) -> str:
+    """As "qpos.0 to qpos.6": the entries from `start` up to `end`, which is none of them."""
+    return f"{word}.{start}" if end == start + 1 else f"{word}.{start} to {word}.{end - 1}"
+
+
+def _joint(model: mujoco.MjModel, i: int) -> str:
+    """A joint's name, or its number."""
+    return model.joint(i).name or f"joint {i}"
+
+
+def _hinges(model: mujoco.MjModel) -> np.ndarray:
+    """The positions that are angles."""
+    return model.jnt_qposadr[model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)]
+
+
+def orientations(model: mujoco.MjModel, observe: Sequence[str] = ()) -> dict[str, list[str]]:
+    """Of each free joint ("root, a free joint") or ball the observed entries of its quaternion."""
+    observed, found = _entries(model, observe), {}
+    kinds = {int(mujoco.mjtJoint.mjJNT_FREE): ("a free joint", 3), int(mujoco.mjtJoint.mjJNT_BALL): ("a ball joint", 0)}
+    for i, (kind, first) in enumerate(zip(model.jnt_type, model.jnt_qposadr, strict=True)):
+        called, behind = kinds.get(int(kind), ("", 0))
+        entries = range(int(first) + behind, int(first) + behind + 4)
+        if called and (seen := [f"qpos.{entry}" for entry in observed if entry in entries]):
+            found[f"{_joint(model, i)}, {called}"] = seen
+    return found
 
 
 def _rates(model: mujoco.MjModel, entries: np.ndarray) -> tuple[int, ...]:
@@ -207,6 +255,11 @@ def _limits(model: mujoco.MjModel, low: Sequence[float], high: Sequence[float]) 
     ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, [-np.inf, np.inf])
     lows = filled("control_low", low, model.nu, ranges[:, 0])
     highs = filled("control_high", high, model.nu, ranges[:, 1])
+    if len(low) and len(high) and len(low) != len(high):
+        raise ValueError(
+            f"control_low has {len(low)} and control_high has {len(high)} numbers; expected {model.nu} in both, or one"
+            " for all in both"
+        )
     for i, (least, greatest) in enumerate(zip(lows, highs, strict=True)):
         if not (np.isfinite(least) and np.isfinite(greatest)):
             name = model.actuator(i).name or i
@@ -216,13 +269,28 @@ def _limits(model: mujoco.MjModel, low: Sequence[float], high: Sequence[float]) 
     return lows, highs
 
 
+def within_range(model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> None:
+    """Raises ValueError for limits [U] of which an actuator has narrower ones: MuJoCo would use those, and not say so.
+
+    This is of the plant alone: a prior has the limits of the task, whatever its own file says.
+    """
+    if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL):
+        return
+    for i in np.flatnonzero(model.actuator_ctrllimited):
+        bottom, top = model.actuator_ctrlrange[i]
+        if low[i] < bottom or high[i] > top:
+            raise ValueError(
+                f"actuator {model.actuator(i).name or i}: controls from {low[i]:g} to {high[i]:g} are not among its"
+                f" own, from {bottom:g} to {top:g}"
+            )
+
+
 def full_state_names(model: mujoco.MjModel) -> list[str]:
     """Names of positions, then velocities: a joint's where it is a hinge or a slide, else the entry's."""
     positions, rates = [f"qpos.{i}" for i in range(model.nq)], [f"qvel.{i}" for i in range(model.nv)]
     for i in range(model.njnt):
-        joint = model.joint(i)
         if unit := _UNITS.get(int(model.jnt_type[i])):
-            name = joint.name or f"joint {i}"
+            name = _joint(model, i)
             positions[model.jnt_qposadr[i]] = f"{name} [{unit}]"
             rates[model.jnt_dofadr[i]] = f"{name}' [{unit}/s]"
     return positions + rates

@@ -61,18 +61,21 @@ def make(name: str, legs: int = 2, constants: Sequence[str] = ()) -> Task:
 
 def of_config(config: Config) -> Task:
     """The task that a config names."""
-    own = {GYM: from_gym, MJCF: from_mjcf}
-    task = own[config.task](config) if config.task in own else make(config.task, config.legs, config.env_args)
-    if config.cost is not None and config.task not in own:
-        task = task._replace(cost=Cost(user_code.load("cost", config.cost)))
-    if config.starts and task.environment is None:
-        task = from_starts(task, config.starts)
-    task = sensed.sensed(with_signals(task, config), config.sensors)
+    task = sensed.sensed(with_signals(unsensed(config), config), config.sensors)
     return task._replace(
         constraint=constrained.of_config(config, task),
         guide=guide.of_config(config, task),
         prior=priors.of_config(config, task),
     )
+
+
+def unsensed(config: Config) -> Task:
+    """The task that a config names, as it is without the config's sensors."""
+    own = {GYM: from_gym, MJCF: from_mjcf}
+    task = own[config.task](config) if config.task in own else make(config.task, config.legs, config.env_args)
+    if config.cost is not None and config.task not in own:
+        task = task._replace(cost=Cost(user_code.load("cost", config.cost)))
+    return from_starts(task, config.starts) if config.starts and task.environment is None else task
 
 
 def rates_of(task: Task) -> tuple[int, ...]:
@@ -232,8 +235,10 @@ def compared(config: Config, task: Task) -> None:
     if config.task == MJCF:
         from pegasus_envs import mjcf_check
 
+        # Late, a plant's state holds controls that wait too, which MuJoCo knows nothing of.
+        plant = unsensed(config).plant if config.sensors.delay else task.plant
         with _refused(f"mjcf={config.mjcf}"):
-            mjcf_check.compare(task.plant)
+            mjcf_check.compare(plant)
 
 
 def described(config: Config) -> dict[str, str]:
@@ -278,20 +283,32 @@ def environment(config: Config, **more: Any) -> Any:
 
 def from_mjcf(config: Config) -> Task:
     """The task that an MJCF file and a cost of its observations pose. Raises ConfigError if they cannot."""
-    if None in (config.mjcf, config.cost, config.dt, config.horizon):
-        raise ConfigError(
-            "task=mjcf needs mjcf=, cost=, dt= and horizon=; for example "
-            "mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40"
-        )
+    examples = {"mjcf": "arm.xml", "cost": "mymodule:cost", "dt": "0.05", "horizon": "40"}
+    if missing := [f"{name}=" for name in examples if getattr(config, name) is None]:
+        words = " and ".join(filter(None, [", ".join(missing[:-1]), missing[-1]]))
+        example = " ".join(f"{name}{examples[name[:-1]]}" for name in missing)
+        raise ConfigError(f"task=mjcf needs {words}; for example {example}")
     from pegasus_envs import mjcf_plant
 
     names = ("observe", "control_low", "control_high", "start_mean", "start_std")
     with _refused(f"mjcf={config.mjcf}"):
         model = mjcf_plant.read(Path(config.mjcf or ""))
         plant = mjcf_plant.mechanism(model, config.dt or 0.0, **{name: getattr(config, name) for name in names})
+        mjcf_plant.within_range(model, plant.control_low, plant.control_high)
+    _of_hinges(config.angles, plant.hinges, plant.state_names, mjcf_plant.NAMED)
     name = Path(config.mjcf or "").stem
     task = _of_users(config, name, plant, plant, config.horizon or 0, plant.state_names, plant.control_names)
     return task._replace(rates=plant.rates)
+
+
+def _of_hinges(angles: tuple[int, ...], hinges: tuple[int, ...], names: tuple[str, ...], most: int) -> None:
+    """Raises ConfigError for an angle that is no position of a hinge, and names the nearest ones, at most so many."""
+    for entry in angles:
+        if entry not in hinges:
+            what = names[entry] if 0 <= entry < len(names) else "not an entry of the observation"
+            nearest = sorted(sorted(hinges, key=lambda i: abs(i - entry))[:most])
+            choices = f"choose from {', '.join(f'{i} {names[i]}' for i in nearest)}" if nearest else "leave it out"
+            raise ConfigError(f"angles={entry} is {what}, and only positions of hinges are angles; {choices}")
 
 
 def mjcf_digest(task: Task) -> str | None:
