@@ -1,4 +1,4 @@
-"""The loop of Alg. 1 as three seams: collect (the plant), add_episode (the data), improve (the mind)."""
+"""Alg. 1: `collect` runs an episode on the plant, `add_episode` stores it, `improve` fits and searches."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -44,7 +44,7 @@ class Trajectory(NamedTuple):
 
 
 class Prediction(NamedTuple):
-    """A model's word on the next change of state."""
+    """A model's prediction of the next change of state."""
 
     mean: Array  # [D] change of state
     std: Array  # [D] standard deviation of the observation noise around it

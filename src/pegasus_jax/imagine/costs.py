@@ -183,7 +183,7 @@ def mean(costs: Array) -> Array:
 
 
 def total(costs: Array) -> Array:
-    """Cost of an episode, averaged over particles: the paper's eq. 1 and Alg. 3 line 15."""
+    """Cost of an episode, averaged over particles: eq. 1 and Alg. 3 line 15, of the H states after the first one."""
     return jnp.sum(jnp.mean(costs, 1))
 
 

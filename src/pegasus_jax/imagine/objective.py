@@ -22,8 +22,9 @@ def objective(
     """J(theta) (Alg. 3 line 15): the costs [H, K] of the rollout's states, made one number by `aggregate`.
 
     `cost` is a task's, or a function of all states x [H, K, D] -> [H, K], or -> [H, 1] where it is one for all
-    particles. `how` are the keywords of `rollout`: dynamics, policy, match, and maybe noise and limit. As no gradient
-    flows through predicted noise, differences agree with it where that is constant, or with noise=NoiseUse(policy=0).
+    particles. `how` are the keywords of `rollout`: dynamics, policy, match, and maybe noise and limit. No gradient
+    flows through predicted noise: finite differences of J are its gradient only where that noise is constant, or with
+    noise=NoiseUse(policy=0).
 
     Raises ValueError, while it is traced, for costs of another shape.
     """

@@ -37,8 +37,9 @@ def rollout(
 ) -> Rollout:
     """Roll K particles out for H steps (Alg. 3 lines 6 to 14): states [H + 1, K, D], controls [H, K, U].
 
-    Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match` is
-    `matching.match` or `matching.keep`. No gradient flows through the predicted noise. With a `limit`, none goes back
+    Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match`,
+    such as `matching.match` or `matching.keep`, makes the particles of the next step of x [K, D] and of z [K, D] from
+    the standard normal distribution. No gradient flows through the predicted noise. With a `limit`, none goes back
     through a particle's state that is longer than that. What the policy remembers is of what it observed, noise
     included.
 

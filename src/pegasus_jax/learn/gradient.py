@@ -33,7 +33,8 @@ def gradient_search(
 ) -> tuple[TrainState, SearchInfo]:
     """Alg. 3 as printed: `steps` updates along the gradient of `objective` under the scenarios of each iteration.
 
-    The learner is policy parameters and `optimizer.init` of them. Where the objective or its gradient is not finite, an
+    The learner is policy parameters and `optimizer.init` of them. `optimizer` has the clip of lines 17 and 18 in it:
+    optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-3)). Where the objective or its gradient is not finite, an
     update changes nothing. The information has an entry for each of the N steps, [N].
     """
 

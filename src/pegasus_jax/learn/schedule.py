@@ -25,10 +25,11 @@ class SearchTable(NamedTuple):
     iteration: Any  # [R] the iteration that the row belongs to, 0..N-1: N iterations can be cut anywhere
     scenarios: Any  # [R] the iteration whose scenarios it is under: after the last step of a phase, the next one
     action: Any  # [R] STEP goes on from the candidate, along its gradient; EVALUATE compares costs
-    # [R] CURRENT: what the search has now. To evaluate one of the others takes it in place of CURRENT, evaluated in the
-    # row before, if it costs no more: FRESH, a policy that knows nothing; OTHER and LEADER, the second of a race and
-    # the first as it was (learn/race.py); START, what the search was given; COARSE, what the refinement started from.
-    # The last two are also taken where a cost is NaN; FRESH is not.
+    # [R] CURRENT: what the search has now. To evaluate one of the others may take it in place of CURRENT, evaluated in
+    # the row before. FRESH, a policy that knows nothing: if it costs no more, and always where the last search gained
+    # nothing or the given policy works. OTHER and LEADER, the second of a race and the first as it was (learn/race.py):
+    # LEADER if it costs less, or CURRENT's cost is NaN. START, what the search was given, and COARSE, what the
+    # refinement started from: if they cost no more, or a cost is NaN.
     candidate: Any
     refine: Any  # [R] whether the objective is the refining one
     counts: Any  # [R] whether a step's objective counts in the mean of its round of refinement

@@ -89,7 +89,7 @@ def after(
 ) -> tuple[TrainState, Array, Array]:
     """What a row makes of the cost and gradient of what it visited -> (learner, cost of its parameters, skipped)."""
     (params, state), finite, steps_now = learner, is_finite((value, gradient)), row.action == STEP
-    # NaN decides for the older policy, a tie for the other one: where the cost is flat, nothing else leads away.
+    # Which policy is taken says `SearchTable.candidate`. A tie leaves CURRENT: where a cost is flat nothing else does.
     older = ~(state.last < value)
     # A fresh policy is also where a search begins that is to find another than the given one.
     fresh = (value <= state.last) | state.no_improvement | (state.worked > 0)

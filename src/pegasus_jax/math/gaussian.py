@@ -28,7 +28,7 @@ __all__ = ["Image", "affine", "chain", "joint", "residual", "sincos", "squash"]
 
 
 class Image(NamedTuple):
-    """The Gaussian that matches f(x), and how it hangs together with x."""
+    """The Gaussian that matches f(x), and its covariance with x."""
 
     mean: Array  # [F] E[f(x)]
     cov: Array  # [F, F] Cov(f(x))
