@@ -366,7 +366,7 @@ def test_what_did_not_take_place_costs_what_the_user_says() -> None:
     ("words", "message"),
     [
         ([], "task=gym needs env= and cost="),
-        (["env=Pendulum-v1"], "task=gym needs env= and cost="),
+        (["env=Pendulum-v1"], "task=gym needs cost=; for example cost=mymodule:cost"),
         (["env=Pendulumm-v1", "cost=costs:upright"], "Pendulum"),
         (
             ["env=CartPole-v1", "cost=costs:upright"],

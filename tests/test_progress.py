@@ -139,11 +139,18 @@ def test_what_will_be_done_and_how_to_go_on(tmp_path: Path) -> None:
     config = parse({"task": "cartpole", "model": "gp", "trials": "4"})
     assert announcement(config, Path("runs/a")) == "learning cartpole, model gp, policy mlp: 4 trials, folder runs/a"
     assert "3 of 4 trials are done, 2 seeds" in announcement(config, Path("runs/a"), 2, 3)
+    for word in ("log_normal", "deterministic", "ensemble", "lagrangian"):
+        assert f"model {word}, policy" in announcement(parse({"model": word}), Path("a"))
+    assert "model log_normal of 5," in announcement(parse({"task": "swimmer_knife_edge"}), Path("a"))
     assert "begins again" in stopped(tmp_path)
     run = tmp_path / "my run"
     run.mkdir()
     (run / "config.yaml").touch()
+    assert "stopped before the first episode had ended" in stopped(run)
     assert f"pegasus-train 'resume={run}' goes on" in stopped(run)
+    (run / "episodes").mkdir()
+    (run / "episodes" / "0001.npz").touch()
+    assert "every finished episode is kept" in stopped(run)
 
 
 class Watch:

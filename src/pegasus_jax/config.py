@@ -378,6 +378,14 @@ def label(config: Config) -> str:
     return f"{config.task}-{own}".replace("/", "-").replace(":", "-") if own else config.task
 
 
+def model_word(model: Model) -> str:
+    """What `model=` calls these settings: a network is named by the noise on its units, or as an ensemble."""
+    if not isinstance(model, BNN):
+        return model.kind
+    plain = {"none": "ensemble" if model.ensemble_size > 1 else "deterministic"}.get(model.dropout)
+    return plain or model.dropout + (f" of {model.ensemble_size}" if model.ensemble_size > 1 else "")
+
+
 def uses(task: str, name: str) -> bool:
     """Whether a task uses the setting of this name: one of a plant's own is of use to some tasks only."""
     (of,) = (f.metadata.get("of", ()) for f in dataclasses.fields(Config) if f.name == name)

@@ -11,7 +11,7 @@ from typing import Any
 import imageio.v3 as iio
 
 from pegasus_jax.checks import shown
-from pegasus_jax.config import label
+from pegasus_jax.config import label, model_word
 from pegasus_jax.episode import mean_cost
 from pegasus_jax.report import driven, read
 from pegasus_jax.report.curves import calibration, learning, trials
@@ -34,7 +34,7 @@ def title(found: Look) -> str:
 def lead(found: Look) -> str:
     """The lines below the title."""
     when = time.strftime("%Y-%m-%d %H:%M")
-    kinds = f"model {found.config.model.kind}, policy {found.config.policy.kind}"
+    kinds = f"model {model_word(found.config.model)}, policy {found.config.policy.kind}"
     return f'<p class="soft">{escape(kinds)}. Folder <code>{escape(str(found.path))}</code>, read {when}.</p>' + cards(
         found
     )

@@ -15,7 +15,7 @@ from rich.console import Console, Group
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
-from pegasus_jax.config import Config, label
+from pegasus_jax.config import Config, label, model_word
 from pegasus_jax.runs.trials_table import BLOCKS, PLAIN, best, count_solved, curves, solved, table
 from pegasus_jax.shell import typed
 
@@ -207,7 +207,7 @@ def duration(seconds: float) -> str:
 
 def announcement(config: Config, home: Path, seeds: int = 1, done: int | None = None) -> str:
     """What a command will do, before it does anything: `done` trials of the run are there, None for a new one."""
-    what = f"{label(config)}, model {config.model.kind}, policy {config.policy.kind}"
+    what = f"{label(config)}, model {model_word(config.model)}, policy {config.policy.kind}"
     several = f", {seeds} seeds" if seeds > 1 else ""
     if done is None:
         return f"learning {what}: {config.trials} trials{several}, folder {home}"
@@ -227,6 +227,8 @@ def stopped(home: Path) -> str:
     """What a person who has stopped a run can do next."""
     if not (home / "config.yaml").exists() and not any(home.glob("seed*/config.yaml")):
         return f"stopped before the first trial of {home}; the same command begins again"
+    if not any(home.glob("**/episodes/*.npz")):
+        return f"stopped before the first episode had ended; {typed(['pegasus-train', f'resume={home}'])} goes on"
     return f"stopped; every finished episode is kept, {typed(['pegasus-train', f'resume={home}'])} goes on"
 
 

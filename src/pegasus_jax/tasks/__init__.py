@@ -196,7 +196,11 @@ def close(task: Task) -> None:
 def _complete(config: Config) -> None:
     """Raises ConfigError unless an environment is named, and a cost that there is: no robot is opened for nothing."""
     if config.env is None or config.cost is None:
-        raise ConfigError("task=gym needs env= and cost=; for example env=Pendulum-v1 cost=mymodule:cost")
+        lacks = {"env": "env=Pendulum-v1", "cost": "cost=mymodule:cost"}
+        lacks = {name: example for name, example in lacks.items() if getattr(config, name) is None}
+        raise ConfigError(
+            f"task=gym needs {' and '.join(f'{name}=' for name in lacks)}; for example {' '.join(lacks.values())}"
+        )
     terms.agree(user_code.load("cost", config.cost), *named(config))
     if config.constraint is not None:
         user_code.load("constraint", config.constraint)
