@@ -97,6 +97,17 @@ def test_a_constant_column_stays_finite(full, value):
 
 
 @both
+@pytest.mark.parametrize("value", [0.0, 3.14, -1e4])
+def test_a_column_that_never_varied_is_told_from_small_and_correlated_ones(full, value):
+    rows = correlated(0)
+    rows[:, 1] = value
+    rows[:, 0] *= 1e-4
+    rows[:, 2] = rows[:, 0] + 2e-2 * np.std(rows[:, 0]) * rows[:, 2]
+    w = whitener(jnp.asarray(rows), jnp.int32(N), full=full)
+    assert module.varied(w).tolist() == [True, False, True]
+
+
+@both
 def test_a_dependent_column_stays_finite(full):
     rows = correlated(1)
     rows[:, 2] = rows[:, 0] - 2 * rows[:, 1]

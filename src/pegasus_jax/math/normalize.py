@@ -67,7 +67,7 @@ def independent(correlation: Array, least: float = 1e-4) -> Array:
 def varied(w: Whitener) -> Array:
     """Whether each column [F] has varied, by more than rounding; the scale of one that has not is not known."""
     rounding = 16 * jnp.finfo(w.root.dtype).eps * jnp.abs(w.mean)
-    return jnp.diagonal(w.root) > jnp.maximum(rounding, 1.01e-6)  # 1e-6: the floor of `whitener`
+    return jnp.linalg.norm(w.root, axis=1) > jnp.maximum(rounding, 1.01e-6)  # 1e-6: the floor of `whitener`
 
 
 def whiten(w: Whitener, rows: Array) -> Array:
