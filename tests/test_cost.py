@@ -165,7 +165,7 @@ def test_a_widened_cost_is_that_of_a_smaller_error(x64):
     of_state, of_gaussian = (jax.jit(lambda f, *a, i=i: wide(f)[i](*a)) for i in range(2))
     third = cost.saturating(lambda x: error(x) / 3, 0.7, (1,))
     np.testing.assert_allclose(of_state(3.0, x), third.of_state(x), rtol=1e-10)
-    expected = third.expected(x, root @ root.T)
+    expected = jax.jit(third.expected)(x, root @ root.T)
     np.testing.assert_allclose(of_gaussian(3.0, x, root @ root.T), expected, rtol=1e-10)
 
 

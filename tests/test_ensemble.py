@@ -22,7 +22,7 @@ def pair():
     """A member and an ensemble of it; its parameters."""
     member = dynamics_of(BNN(hidden=(8,), dropout="none"), cart())
     many = ensemble(member, MEMBERS)
-    return member, many, many.init(jax.random.key(0))
+    return member, many, jax.jit(many.init)(jax.random.key(0))
 
 
 def rows(size=40):
@@ -37,16 +37,20 @@ def part(tree, index):
 def test_a_particle_follows_one_member(pair):
     member, many, params = pair
     data = rows()
-    posterior = many.posterior(params, data)
     x, u = jnp.array([0.3, -0.2]), jnp.array([0.5])
-    alone = []
-    for index in range(MEMBERS):
-        own = member.posterior(part(params, index), data)
-        alone.append(member.apply(own, member.sample(jax.random.key(9), own), x, u).mean)
+
+    def of(dynamics):
+        def predicted(params, key):
+            posterior = dynamics.posterior(params, data)
+            return dynamics.apply(posterior, dynamics.sample(key, posterior), x, u)
+
+        return jax.jit(predicted)
+
+    one, several = of(member), of(many)
+    alone = [one(part(params, index), jax.random.key(9)).mean for index in range(MEMBERS)]
     followed = set()
     for seed in range(12):
-        draw = many.sample(jax.random.key(seed), posterior)
-        predicted = many.apply(posterior, draw, x, u)
+        predicted = several(params, jax.random.key(seed))
         distance = np.abs(np.asarray(alone) - np.asarray(predicted.mean)).max(axis=1)
         followed.add(int(distance.argmin()))
         assert distance.min() < 1e-6
@@ -56,7 +60,7 @@ def test_a_particle_follows_one_member(pair):
 
 def test_members_are_followed_equally_often(pair):
     _, many, params = pair
-    posterior = many.posterior(params, rows())
+    posterior = jax.jit(many.posterior)(params, rows())
     chosen, _ = jax.vmap(many.sample, (0, None))(jax.random.split(jax.random.key(1), 3000), posterior)
     np.testing.assert_allclose(chosen.mean(0), 1 / MEMBERS, atol=4 * np.sqrt(2 / 9 / 3000))
 
@@ -65,12 +69,13 @@ def test_members_are_followed_equally_often(pair):
 def test_particles_together_are_what_each_would_be_alone(pair, particles):
     """Dealt in turn, they need no other member's arithmetic; drawn one by one, they are not mistaken for dealt ones."""
     _, many, params = pair
-    posterior = many.posterior(params, rows())
+    posterior = jax.jit(many.posterior)(params, rows())
     keys = lambda: jax.random.split(jax.random.key(1), particles)  # noqa: E731
     x, u = (jax.random.normal(jax.random.key(i), (particles, width)) for i, width in enumerate((2, 1)))
-    each = jax.vmap(many.apply, (None, 0, 0, 0))
-    together = for_particles(many.apply)
-    dealt, drawn = many.deal(keys(), posterior), jax.vmap(many.sample, (0, None))(keys(), posterior)
+    each = jax.jit(jax.vmap(many.apply, (None, 0, 0, 0)))
+    together = jax.jit(for_particles(many.apply))
+    dealt = jax.jit(many.deal)(keys(), posterior)
+    drawn = jax.jit(jax.vmap(many.sample, (0, None)))(keys(), posterior)
     assert np.argmax(dealt.chosen, 1).tolist() == [k % MEMBERS for k in range(particles)]
     for draws in (dealt, drawn):
         for one, other in zip(together(posterior, draws, x, u), each(posterior, draws, x, u), strict=True):
@@ -83,17 +88,18 @@ def test_a_dealt_particles_draw_is_of_its_member():
     """Where noise is learned, the k-th particle's is that of member k modulo their number, drawn by its own key."""
     member = dynamics_of(BNN(hidden=(8,), dropout="log_normal"), cart())
     many = ensemble(member, MEMBERS)
-    posterior = many.posterior(many.init(jax.random.key(0)), rows())
-    dealt = many.deal(jax.random.split(jax.random.key(1), 7), posterior)
+    posterior = jax.jit(lambda key: many.posterior(many.init(key), rows()))(jax.random.key(0))
+    dealt = jax.jit(many.deal)(jax.random.split(jax.random.key(1), 7), posterior)
+    sample = jax.jit(member.sample)
     for k, key in enumerate(jax.random.split(jax.random.key(1), 7)):
-        alone = member.sample(key, part(posterior, k % MEMBERS))
+        alone = sample(key, part(posterior, k % MEMBERS))
         for one, other in zip(jax.tree.leaves(alone), jax.tree.leaves(part(dealt.own, k)), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-6)
 
 
 def test_as_many_imagined_particles_follow_each_member(pair):
     _, many, params = pair
-    posterior = many.posterior(params, rows())
+    posterior = jax.jit(many.posterior)(params, rows())
     task, policy = cart(), policy_of(MLP(), cart())
     drawn = draw(jax.random.key(0), 0, posterior, blocks=blocks_of(13, task, many, policy), period=Period())
     assert drawn.dynamics.chosen.sum(0).tolist() == [5, 4, 4]
@@ -104,7 +110,7 @@ def test_a_members_gradient_is_its_own(pair):
     _, many, params = pair
     data = rows()
     context = many.prepare(data)
-    gradient = jax.grad(many.loss)
+    gradient = jax.jit(jax.grad(many.loss))
     batch = Batch(*data[:3])
     before = gradient(params, jax.random.key(3), batch, context)
     moved = jax.tree.map(lambda leaf: leaf.at[0].add(0.3), params)
@@ -122,5 +128,5 @@ def test_members_see_different_rows(pair):
     _, many, params = pair
     data = rows()
     equal = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], leaf.shape), params)
-    gradient = jax.grad(many.loss)(equal, jax.random.key(3), Batch(*data[:3]), many.prepare(data))
+    gradient = jax.jit(jax.grad(many.loss))(equal, jax.random.key(3), Batch(*data[:3]), many.prepare(data))
     assert any(not np.allclose(leaf[0], leaf[1]) for leaf in jax.tree.leaves(gradient))

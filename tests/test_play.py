@@ -33,11 +33,22 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_film_of_a_tiny_run(run: Path) -> None:
+def test_a_film_of_a_tiny_run_replaces_a_link_and_what_it_leads_to_stays(run: Path, tmp_path: Path) -> None:
+    """Neither where the film goes nor where it is written is a file that was there opened."""
+    kept = tmp_path / "kept"
+    kept.write_text("mine")
+    for name in ("play.mp4", ".play.mp4"):
+        (run / name).symlink_to(kept)
     done = call("play", run, "seed=3", cwd=run.parent, **OPTIMISED)
     assert (done.returncode, done.stderr.startswith("best policy: trial 1")) == (0, True), done.stderr
     assert done.stdout.split() == [str(run / "play.mp4")]
-    assert not list(run.glob(".play*"))
+    assert kept.read_text() == "mine"
+    assert not (run / "play.mp4").is_symlink()
+    mask = os.umask(0)
+    os.umask(mask)
+    assert (run / "play.mp4").stat().st_mode & 0o777 == 0o666 & ~mask
+    assert [path.name for path in run.glob(".play*")] == [".play.mp4"]  # the link that was there
+    (run / ".play.mp4").unlink()
     reader = imageio.get_reader(run / "play.mp4")
     pictures = [picture.astype(int) for picture in reader]
     assert len(pictures) == 50  # 25 control periods of .1 s
@@ -69,24 +80,6 @@ def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
     assert drawn.shape[1:] == (48, 64, 3)
     assert len(drawn) % 2 == 0
     assert drawn.std() > 0  # something is to be seen
-
-
-@pytest.mark.slow
-def test_a_film_replaces_a_link_and_what_it_leads_to_stays(run: Path, tmp_path: Path) -> None:
-    """Neither where the film goes nor where it is written is a file that was there opened."""
-    kept = tmp_path / "kept"
-    kept.write_text("mine")
-    for name in ("play.mp4", ".play.mp4"):
-        (run / name).unlink(missing_ok=True)
-        (run / name).symlink_to(kept)
-    done = call("play", run, cwd=run.parent, **OPTIMISED)
-    assert done.returncode == 0, done.stderr
-    assert kept.read_text() == "mine"
-    assert not (run / "play.mp4").is_symlink()
-    mask = os.umask(0)
-    os.umask(mask)
-    assert (run / "play.mp4").stat().st_mode & 0o777 == 0o666 & ~mask
-    (run / ".play.mp4").unlink()
 
 
 def test_curves_appear_as_time_goes_on() -> None:

@@ -187,7 +187,7 @@ def test_a_large_entry_does_not_saturate_a_policy(kind, name):
     def sizes(params):
         controls = lambda params: jnp.sum(jax.vmap(lambda x: policy.apply(params, None, x))(x) ** 2)  # noqa: E731
         slopes = jax.vmap(lambda key: optax.tree.norm(jax.grad(controls)(params(key))))
-        return np.asarray(slopes(jax.random.split(jax.random.key(0), 10)))
+        return np.asarray(jax.jit(slopes)(jax.random.split(jax.random.key(0), 10)))
 
     given = sizes(lambda key: policy.adapt(policy.init(key), data))
     assert np.isfinite(given).all()

@@ -356,16 +356,17 @@ def test_an_environment_gets_rates_as_a_robot_computes_them():
     np.testing.assert_array_equal(task.start_mean, [1, 0])
     config = tiny(sensors=config.sensors, search__steps=2, fit__steps=2, trials=2, **PLAIN)
     exp = compose(config, task)
-    state = exp.init(jax.random.key(0))
+    state = jax.jit(exp.init)(jax.random.key(0))
+    add_episode = jax.jit(exp.add_episode)
     ran = exp.collect(state)
     x, u = np.asarray(ran.x), np.asarray(ran.u)
     np.testing.assert_allclose(x[1:, 1], np.diff(x[:, 0]) / DT, rtol=1e-4)
     assert x[0, 1] == 0
-    added = exp.add_episode(state, ran)
+    added = add_episode(state, ran)
     np.testing.assert_allclose(added.data.u[:8, 0], [0, *u[:-1, 0]])  # aligned: the control that acted
-    state, _ = exp.improve(added)
+    state, _ = jax.jit(exp.improve)(added)
     later = exp.collect(state)
     see = jax.vmap(memory.steps(exp.task.memory)[0])
-    seen = see(memory.replay(exp.task.memory, later)[:-1], later.x[:-1])
+    seen = jax.jit(lambda later: see(memory.replay(exp.task.memory, later)[:-1], later.x[:-1]))(later)
     np.testing.assert_allclose(seen[:, 0], later.x[:-1, 0])
     np.testing.assert_allclose(seen[:, -1], later.x[:-1, 1], rtol=1e-3, atol=1e-4)  # as the rows' own differences

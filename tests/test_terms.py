@@ -202,7 +202,7 @@ def test_the_expectation_of_a_cost_of_controls_is_that_of_their_gaussian(x64):
     particles = jax.random.normal(jax.random.key(0), (100, 4)) @ spread.T + jnp.array([0.1, 0, 0.2, -0.3])
     weights = np.array([1.0, 0, 1, -2])
     mean, cov = np.mean(particles, 0), np.cov(particles.T)
-    found = costs.of_matched(task.cost)(particles[None])
+    found = jax.jit(costs.of_matched(task.cost))(particles[None])
     np.testing.assert_allclose(found, [[(weights @ mean) ** 2 + weights @ cov @ weights]], rtol=1e-6)
 
 

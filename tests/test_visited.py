@@ -112,9 +112,9 @@ def test_a_search_on_a_plant_of_ones_own_drops_what_is_too_steep(monkeypatch):
             task,
             cost=lambda x: factor * (1 + task.cost.of_state(x)),
         )
-        state = experiment.init(jax.random.key(0))
-        state = experiment.add_episode(state, experiment.collect(state))
-        return float(experiment.search(state)[1].gradient_norm[0])
+        state = jax.jit(experiment.init)(jax.random.key(0))
+        state = jax.jit(lambda state: experiment.add_episode(state, experiment.collect(state)))(state)
+        return float(jax.jit(experiment.search)(state)[1].gradient_norm[0])
 
     usual = norm(10.0)
     assert norm(1e-3) < 0.9 * usual
@@ -139,11 +139,12 @@ def test_particles_with_a_goal_are_not_matched():
     def first(goal, **search):
         settings = dict(visited_starts=0.5, refine_fraction=0.5, cost_width_start=1.0) | search
         experiment = compose(tiny(**{f"search__{name}": value for name, value in settings.items()}), cart())
-        state = experiment.init(jax.random.key(0))
-        state = experiment.add_episode(state, experiment.collect(state))
+        state = jax.jit(experiment.init)(jax.random.key(0))
+        state = jax.jit(lambda state: experiment.add_episode(state, experiment.collect(state)))(state)
         y = state.data.y.at[:, 0].set(0.0) if goal else state.data.y
         state = state._replace(data=state.data._replace(y=y))
-        return float(experiment.search(experiment.fit(state)[0])[1].objective[0])
+        fitted = jax.jit(experiment.fit)(state)[0]
+        return float(jax.jit(experiment.search)(fitted)[1].objective[0])
 
     apart = dict(matching="never", cost_estimator="particles")
     assert first(goal=True, matching="always") == pytest.approx(first(goal=True, **apart), rel=1e-5)
