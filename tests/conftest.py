@@ -13,7 +13,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # them no more, and end a process that is given those.
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "1")
 os.environ["XLA_FLAGS"] = " ".join(
-    ["--xla_cpu_use_fusion_emitters=false", "--xla_backend_optimization_level=0", "--xla_cpu_prefer_vector_width=256"]
+    [
+        "--xla_cpu_use_fusion_emitters=false",
+        "--xla_backend_optimization_level=0",
+        "--xla_cpu_prefer_vector_width=256",
+        "--xla_cpu_parallel_codegen_split_count=1",  # a small program in many parts takes longer
+    ]
     * (version("jaxlib") < "0.11")
     + os.environ.get("XLA_FLAGS", "").split()
 )

@@ -1,6 +1,6 @@
 """Controllers: within the limits whatever they see, one mask along a rollout, and a mean policy without any."""
 
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -177,19 +177,27 @@ LARGE = {
 }
 
 
+@cache
+def slopes_of(kind):
+    """Data -> how large the gradients of fresh policies are that were adapted to them; compiled once for all data."""
+    policy = KINDS[kind]()
+
+    def slopes(data):
+        def slope(key):
+            controls = lambda params: jax.vmap(lambda x: policy.apply(params, None, x))(data.x[:30])  # noqa: E731
+            squares = jax.grad(lambda params: jnp.sum(controls(params) ** 2))
+            return optax.tree.norm(squares(policy.adapt(policy.init(key), data)))
+
+        return jax.vmap(slope)(jax.random.split(jax.random.key(0), 10))
+
+    return jax.jit(slopes)
+
+
 @every_kind
 @pytest.mark.parametrize("name", LARGE)
 def test_a_large_entry_does_not_saturate_a_policy(kind, name):
     """A fresh policy's gradient by its parameters is of the size that it has without the entry."""
-    policy, data = KINDS[kind](), with_entry(LARGE[name])
-    x = data.x[:30]
-
-    def sizes(params):
-        controls = lambda params: jnp.sum(jax.vmap(lambda x: policy.apply(params, None, x))(x) ** 2)  # noqa: E731
-        slopes = jax.vmap(lambda key: optax.tree.norm(jax.grad(controls)(params(key))))
-        return np.asarray(jax.jit(slopes)(jax.random.split(jax.random.key(0), 10)))
-
-    given = sizes(lambda key: policy.adapt(policy.init(key), data))
+    given = np.asarray(slopes_of(kind)(with_entry(LARGE[name])))
     assert np.isfinite(given).all()
     if kind == "rbf" and name != "constant":  # its centres are drawn where episodes start: here at 1e4, give or take 1
         return

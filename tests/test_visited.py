@@ -139,12 +139,11 @@ def test_particles_with_a_goal_are_not_matched():
     def first(goal, **search):
         settings = dict(visited_starts=0.5, refine_fraction=0.5, cost_width_start=1.0) | search
         experiment = compose(tiny(**{f"search__{name}": value for name, value in settings.items()}), cart())
-        state = jax.jit(experiment.init)(jax.random.key(0))
-        state = jax.jit(lambda state: experiment.add_episode(state, experiment.collect(state)))(state)
+        state = experiment.init(jax.random.key(0))
+        state = experiment.add_episode(state, experiment.collect(state))
         y = state.data.y.at[:, 0].set(0.0) if goal else state.data.y
         state = state._replace(data=state.data._replace(y=y))
-        fitted = jax.jit(experiment.fit)(state)[0]
-        return float(jax.jit(experiment.search)(fitted)[1].objective[0])
+        return float(experiment.search(experiment.fit(state)[0])[1].objective[0])
 
     apart = dict(matching="never", cost_estimator="particles")
     assert first(goal=True, matching="always") == pytest.approx(first(goal=True, **apart), rel=1e-5)
