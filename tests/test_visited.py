@@ -112,9 +112,9 @@ def test_a_search_on_a_plant_of_ones_own_drops_what_is_too_steep(monkeypatch):
             task,
             cost=lambda x: factor * (1 + task.cost.of_state(x)),
         )
-        state = jax.jit(experiment.init)(jax.random.key(0))
-        state = jax.jit(lambda state: experiment.add_episode(state, experiment.collect(state)))(state)
-        return float(jax.jit(experiment.search)(state)[1].gradient_norm[0])
+        state = experiment.init(jax.random.key(0))
+        state = experiment.add_episode(state, experiment.collect(state))
+        return float(experiment.search(state)[1].gradient_norm[0])
 
     usual = norm(10.0)
     assert norm(1e-3) < 0.9 * usual
