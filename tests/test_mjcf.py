@@ -41,6 +41,10 @@ def config(path: Path | str = PENDULUM, **changes: object) -> Config:
     return Config(**({"task": "mjcf", "mjcf": str(path), "cost": "math:sin", "dt": 0.04, "horizon": 8} | changes))  # type: ignore[arg-type]
 
 
+def rotations(made: Config) -> list[str]:
+    return assumed.rotations(made, tasks.of_config(made))
+
+
 def test_follows_c_through_limits_and_is_pure(pendulum: mjcf_plant.Mechanism) -> None:
     """Two episodes at once, each against C MuJoCo: the cart hits the ends of its rail, which are constraints."""
     controls = np.random.default_rng(0).uniform(-3, 3, (2, 50, 1)).astype(np.float32)
@@ -323,17 +327,17 @@ def test_a_quaternion_is_no_angle_and_is_told(
     first: str, of: str, others: tuple[int, int], angle: int, choices: str, tmp_path: Path
 ) -> None:
     path = two(tmp_path / "two.xml", first)
-    (note,) = assumed.notes(config(path))
+    (note,) = rotations(config(path))
     assert note.startswith(
         f"{of}{', '.join(f'qpos.{i}' for i in range(*others))} are of a quaternion, which is learned"
     )
-    assert assumed.notes(config(path, observe=(f"qpos.{angle}", f"qvel.{angle - 1}"))) == []
+    assert rotations(config(path, observe=(f"qpos.{angle}", f"qvel.{angle - 1}"))) == []
     assert tasks.of_config(config(path, angles=(angle,))).angles == (angle,)
     with pytest.raises(ConfigError, match=rf"angles=0 is qpos.0, and only .*; choose from {angle} wheel \[rad\]$"):
         tasks.of_config(config(path, angles=(0,)))
     with pytest.raises(ConfigError, match=choices):
         tasks.of_config(config(path, observe=("wheel",)))
-    assert assumed.notes(config(two(path, "hinge"))) == []
+    assert rotations(config(two(path, "hinge"))) == []
 
 
 def test_of_many_joints_the_first_and_the_last_are_told(tmp_path: Path) -> None:

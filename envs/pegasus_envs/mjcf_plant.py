@@ -252,9 +252,9 @@ def _rates(model: mujoco.MjModel, entries: np.ndarray) -> tuple[int, ...]:
 
 def _limits(model: mujoco.MjModel, low: Sequence[float], high: Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
     """Least and greatest controls [U], and where neither the user nor the file names them, a refusal."""
-    ranges = np.where(model.actuator_ctrllimited[:, None] > 0, model.actuator_ctrlrange, [-np.inf, np.inf])
-    lows = filled("control_low", low, model.nu, ranges[:, 0])
-    highs = filled("control_high", high, model.nu, ranges[:, 1])
+    bottom, top = _ranges(model)
+    lows = filled("control_low", low, model.nu, bottom)
+    highs = filled("control_high", high, model.nu, top)
     if len(low) and len(high) and len(low) != len(high):
         raise ValueError(
             f"control_low has {len(low)} and control_high has {len(high)} numbers; expected {model.nu} in both, or one"
@@ -276,13 +276,17 @@ def within_range(model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> No
     """
     if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL):
         return
-    for i in np.flatnonzero(model.actuator_ctrllimited):
-        bottom, top = model.actuator_ctrlrange[i]
-        if low[i] < bottom or high[i] > top:
-            raise ValueError(
-                f"actuator {model.actuator(i).name or i}: controls from {low[i]:g} to {high[i]:g} are not among its"
-                f" own, from {bottom:g} to {top:g}"
-            )
+    bottom, top = _ranges(model)
+    for i in np.flatnonzero((low < bottom) | (high > top)):
+        raise ValueError(
+            f"actuator {model.actuator(i).name or i}: controls from {low[i]:g} to {high[i]:g} are not among its"
+            f" own, from {bottom[i]:g} to {top[i]:g}"
+        )
+
+
+def _ranges(model: mujoco.MjModel) -> np.ndarray:
+    """The least and the greatest controls [2, U] that a file gives its actuators, infinite where it gives none."""
+    return np.where(model.actuator_ctrllimited > 0, model.actuator_ctrlrange.T, [[-np.inf], [np.inf]])
 
 
 def full_state_names(model: mujoco.MjModel) -> list[str]:

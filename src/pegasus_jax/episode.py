@@ -132,6 +132,11 @@ def states(task: Task, trajectory: Trajectory) -> Array:
     return recall.join(jnp.asarray(trajectory.x), recall.replay(task.memory, trajectory))
 
 
+def costs(task: Task, trajectory: Trajectory) -> Array:
+    """What each control period [H] of an episode costs, by what was observed; in JAX, to be jitted."""
+    return jax.vmap(task.cost.of_state)(states(task, trajectory)[1:])
+
+
 def charged(cost: Any, task: Task) -> np.ndarray:
     """The costs [H] of an episode of L periods: each of those that an early end left out costs `task.stop_cost`."""
     cost = np.asarray(cost, np.float64)

@@ -206,7 +206,7 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     task = build(replace(first.loaded(config), seed=0), mesh).task
     resets = 1 if asked.config.start_mean else RESETS  # who says where episodes start has nobody reset a robot
     logs, notes = read_config(config, task)
-    notes = checked(config, task) + unsaid(asked.config, config) + before_training(config, task, resets) + notes
+    notes = checked(config, task) + unsaid(asked.config, config, task) + before_training(config, task, resets) + notes
     for note in notes:
         print(f"note: {note}", file=sys.stderr)
     return config, logs

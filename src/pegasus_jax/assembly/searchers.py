@@ -86,7 +86,8 @@ def search_of(
     noise = NoiseUse(search.policy_noise, search.state_noise, known)
     if isinstance(search, settings.Analytic):
         return analytic_search_of(search, task, dynamics, policy, noise)
-    matches = matching_of(search, task) not in (UNMATCHED, MATCHINGS["never"])
+    named = matching_of(search, task)
+    matches = named not in (UNMATCHED, MATCHINGS["never"])
     states = len(task.state_names) + len(task.memory.names)
     if (matches or search.standardized_noise) and search.particles <= states:
         what = "moment matching" if matches else "standardized noise"
@@ -108,7 +109,7 @@ def search_of(
         objective_of = partial(limited.constrained, constraint=constraint)
         ascend = partial(limited.ascend, bound=constraint.bound)
         pieces["dynamics"] = limited.held(dynamics, limited.over(constraint, task.stop))
-    match = matching_of(search, task).particles(task.angles)
+    match = named.particles(task.angles)
     costs = costs_of(search, task)
     refines = search.refine_fraction > 0
 

@@ -9,12 +9,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from pegasus_jax import interrupt, tasks
 from pegasus_jax.checks import ConfigError, RunError, check_range
-from pegasus_jax.episode import Episode, drive, mean_cost, states
+from pegasus_jax.episode import Episode, costs, drive, mean_cost
 from pegasus_jax.exports.asked import asking
 from pegasus_jax.exports.watchdog import Watchdog
 from pegasus_jax.exports.write import export
@@ -108,8 +107,7 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
     def save(ran: Episode) -> Drive:
         ran = ran._replace(trajectory=ran.trajectory._replace(memory=memories[0] if memories else None))
         drove = len(ran.trajectory.u) > 0
-        cost = jax.vmap(task.cost.of_state)(states(task, ran.trajectory)[1:]) if drove else []
-        cost = np.asarray(cost, np.float32)
+        cost = np.asarray(costs(task, ran.trajectory) if drove else [], np.float32)
         kept = ran._replace(trajectory=ran.trajectory._replace(cost=cost))  # type: ignore[arg-type]
         done = Drive(
             log,

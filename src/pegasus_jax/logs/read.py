@@ -110,8 +110,7 @@ def _trajectories(found: list[tuple[Segment, str]], task: Task) -> list[Logged]:
 
     @jax.jit
     def known(whole: Trajectory) -> tuple[Array, Array | None]:
-        costs = jax.vmap(task.cost.of_state)(episode.states(task, whole)[1:])
-        return costs, recall.replay(task.memory, whole)
+        return episode.costs(task, whole), recall.replay(task.memory, whole)
 
     for one, source in found:
         x, u, m = with_rates(one.x, task).astype(kind), one.u.astype(kind), None

@@ -33,7 +33,7 @@ def driver(task: Task, policy: Policy, explore: Callable[[Key], Array]) -> Calla
         return u, advance(m, x, u)
 
     drawn, begin, react = jax.jit(draws), jax.jit(partial(recall.begin, task.memory)), jax.jit(reaction)
-    costs_of = jax.jit(lambda whole: jax.vmap(task.cost.of_state)(episode.states(task, whole)[1:]))
+    costs_of = jax.jit(partial(episode.costs, task))
 
     def compile_all(params: Params, noise: Params, key: Key) -> None:
         """The first control is to be as quick as the others; and a signal is not heard while this thread compiles."""

@@ -77,9 +77,9 @@ def slow(task: Task) -> list[str]:
     return notes
 
 
-def unsaid(given: Config, known: Config) -> list[str]:
+def unsaid(given: Config, known: Config, task: Task) -> list[str]:
     """Notes on what the user did not say of an environment, and what is taken for it; `known` is what is."""
-    return assumed.notes(given) + circles_found(given, known)
+    return assumed.notes(given) + assumed.rotations(given, task) + circles_found(given, known)
 
 
 def circles_found(given: Config, known: Config) -> list[str]:
@@ -183,7 +183,7 @@ def report(config: Config) -> list[str]:
     asked, config = config, tasks.resolve(config)
     task = build(replace(first.loaded(config), seed=0)).task
     logs = read_config(config, task)[1]
-    notes = begin.checked(config, task) + unsaid(asked, config)
+    notes = begin.checked(config, task) + unsaid(asked, config, task)
     notes += before_training(config, task, 1 if given else RESETS) + logs
     wide = width(config, begun := at_starts(task))
     facts: dict[str, Any] = {

@@ -1,6 +1,6 @@
 """Line 3 of Alg. 1 as a job does it: the episodes of a trial, each durable before anything is learned from it."""
 
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from pathlib import Path
 
 import jax
@@ -79,7 +79,7 @@ def costed(job: Job, ran: Episode, trial: int) -> Episode:
     """
     x = np.asarray(ran.trajectory.x)
     task = job.experiment.task
-    cost = costs_of(ran.trajectory, task)
+    cost = np.asarray(episode.costs(task, ran.trajectory))
     for (t,) in np.argwhere(~np.isfinite(cost))[:1]:
         seen = to_observation(x[t + 1], task.circles).tolist()
         found = f"the cost of the observation {seen} is {cost[t]}"
@@ -87,26 +87,24 @@ def costed(job: Job, ran: Episode, trial: int) -> Episode:
     return ran._replace(trajectory=ran.trajectory._replace(cost=cost))
 
 
-def costs_of(trajectory: Trajectory, task: Task) -> np.ndarray:
-    """The cost of each control period of an episode, from what was observed."""
-    return np.asarray(jax.vmap(task.cost.of_state)(episode.states(task, trajectory)[1:]))
-
-
 def other_cost(run: Path, task: Task) -> str | None:
     """What to say where an environment's newest episode costs something else today: its user has changed the cost."""
     stored = store.numbered(run / "episodes", ".npz")
     if task.environment is None or not stored:
         return None
-    with suppress(RunError):  # of a damaged file whoever needs it tells
+    try:
         ran = store.load_episode(run, stored[-1])
-        if ran is not None and len(ran.trajectory.u):
-            before, now = ran.trajectory.cost, costs_of(ran.trajectory, task)
-            if np.isfinite(before).all() and not np.allclose(before, now, rtol=1e-3, atol=1e-4):
-                return (
-                    f"the episode of trial {stored[-1]} cost {np.mean(before):.3g} a step, and with today's cost"
-                    f" {np.mean(now):.3g}: the costs of trials 1 to {stored[-1]} were counted with another one"
-                )
-    return None
+    except RunError:  # whoever needs the damaged file tells
+        return None
+    if ran is None or not len(ran.trajectory.u):
+        return None
+    before, now = ran.trajectory.cost, np.asarray(episode.costs(task, ran.trajectory))
+    if not np.isfinite(before).all() or np.allclose(before, now, rtol=1e-3, atol=1e-4):
+        return None
+    return (
+        f"the episode of trial {stored[-1]} cost {np.mean(before):.3g} a step, and with today's cost"
+        f" {np.mean(now):.3g}: the costs of trials 1 to {stored[-1]} were counted with another one"
+    )
 
 
 def failed(ran: Episode, task: Task, advice: str = "", kept: bool = True) -> None:

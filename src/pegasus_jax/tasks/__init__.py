@@ -195,18 +195,24 @@ def close(task: Task) -> None:
 
 def _complete(config: Config) -> None:
     """Raises ConfigError unless an environment is named, and a cost that there is: no robot is opened for nothing."""
-    if config.env is None or config.cost is None:
-        lacks = {"env": "env=Pendulum-v1", "cost": "cost=mymodule:cost"}
-        lacks = {name: example for name, example in lacks.items() if getattr(config, name) is None}
-        raise ConfigError(
-            f"task=gym needs {' and '.join(f'{name}=' for name in lacks)}; for example {' '.join(lacks.values())}"
-        )
+    _said(config, env="Pendulum-v1", cost="mymodule:cost")
+    assert config.env is not None
+    assert config.cost is not None
     terms.agree(user_code.load("cost", config.cost), *named(config))
     if config.constraint is not None:
         user_code.load("constraint", config.constraint)
     module, colon, _ = config.env.partition(":")
     if colon:  # Gymnasium imports it, to register what is in it
         user_code.importing(f"env={config.env}", module)
+
+
+def _said(config: Config, **examples: str) -> None:
+    """Raises ConfigError, which names those that are missing, unless a config has all of these settings."""
+    if missing := [name for name in examples if getattr(config, name) is None]:
+        *others, last = (f"{name}=" for name in missing)
+        words = f"{', '.join(others)} and {last}" if others else last
+        example = " ".join(f"{name}={examples[name]}" for name in missing)
+        raise ConfigError(f"task={config.task} needs {words}; for example {example}")
 
 
 def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarray]:
@@ -287,11 +293,7 @@ def environment(config: Config, **more: Any) -> Any:
 
 def from_mjcf(config: Config) -> Task:
     """The task that an MJCF file and a cost of its observations pose. Raises ConfigError if they cannot."""
-    examples = {"mjcf": "arm.xml", "cost": "mymodule:cost", "dt": "0.05", "horizon": "40"}
-    if missing := [f"{name}=" for name in examples if getattr(config, name) is None]:
-        words = " and ".join(filter(None, [", ".join(missing[:-1]), missing[-1]]))
-        example = " ".join(f"{name}{examples[name[:-1]]}" for name in missing)
-        raise ConfigError(f"task=mjcf needs {words}; for example {example}")
+    _said(config, mjcf="arm.xml", cost="mymodule:cost", dt="0.05", horizon="40")
     from pegasus_envs import mjcf_plant
 
     names = ("observe", "control_low", "control_high", "start_mean", "start_std")

@@ -1,21 +1,18 @@
 """What a user's plant, and the user, left unsaid, and what is taken for it: notes, one line each."""
 
 from contextlib import suppress
-from pathlib import Path
 
 import numpy as np
 
 from pegasus_jax.config import GYM, MJCF, Config
+from pegasus_jax.task import Task
 
 
 def notes(given: Config) -> list[str]:
-    """Notes on a config as it was `given`: an environment's period, and its episodes that only measure; quaternions.
+    """Notes on a config as it was `given`, whose environment is open: its period, and its episodes that only measure.
 
-    An environment is open. Nothing tells a default from the same number said by the user, so the latter is told what it
-    means too.
+    Nothing tells a default from the same number said by the user, so the latter is told what it means too.
     """
-    if given.task == MJCF:
-        return rotations(given)
     if given.task != GYM:
         return []
     told = period(given)
@@ -32,11 +29,13 @@ def notes(given: Config) -> list[str]:
     return told
 
 
-def rotations(given: Config) -> list[str]:
+def rotations(given: Config, task: Task) -> list[str]:
     """Notes on orientations of an MJCF file's bodies that are observed as quaternions, one each joint."""
+    if given.task != MJCF:
+        return []
     from pegasus_envs import mjcf_plant
 
-    found = mjcf_plant.orientations(mjcf_plant.read(Path(given.mjcf or "")), given.observe)
+    found = mjcf_plant.orientations(task.plant.model, given.observe)
     return [
         f"{joint}: {', '.join(entries)} are of a quaternion, which is learned as plain numbers, so that with noise it"
         " is not quite a rotation; hinges have angles, and observe= can leave it out"
