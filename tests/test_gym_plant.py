@@ -192,6 +192,11 @@ def test_an_end_ends_the_episode_and_no_row_is_invented(made: type, ended: str) 
         assert ran.trajectory.u.shape == (3, 1)
 
 
+def test_a_time_limit_that_is_the_horizon_ends_nothing_early() -> None:
+    ends = [episode.drive(0, lambda t, x: np.ones(1), task_of("Truncates-v0", 1, horizon=n)).ended for n in (3, 4)]
+    assert ends == ["horizon", "truncated"]
+
+
 def test_the_rows_before_an_exception_are_kept_and_the_environment_is_closed() -> None:
     Breaks.closed = 0
     ran = episode.drive(0, lambda t, x: np.ones(1), task_of("Breaks-v0", 1))

@@ -99,6 +99,17 @@ def test_a_trial_that_is_not_the_best_says_which_is() -> None:
     assert ["best so far: trial 1" in line for line in text.getvalue().splitlines()] == [False, True]
 
 
+def test_a_policy_that_has_not_run_is_not_compared() -> None:
+    """What a line of a run without evaluation has measured is the policy that ran, and not the one it learned."""
+    text = io.StringIO()
+    display = Display(9, Console(file=text, width=400))
+    own = ROW | {"mean_cost": None, "success_rate": None, "random": False, "episode_success": False}
+    for trial, cost in enumerate((0.9, 0.7, 0.5, 0.6), 1):
+        display.trial([own | {"trial": trial, "policy": trial - 1, "episode_cost": cost, "random": trial == 1}])
+    said = [line.partition("best so far: ")[2].split("  ")[0] for line in text.getvalue().splitlines()]
+    assert said == ["", "", "", "trial 2"]
+
+
 def test_a_policy_that_a_run_began_with_may_be_the_best() -> None:
     text = io.StringIO()
     display = Display(9, Console(file=text, width=400))
@@ -127,7 +138,9 @@ def test_the_best_policy_is_named() -> None:
     assert best_line([row | {"objective_fresh": None} for row in rows], 3).startswith("no policy was learned")
     assert best_line(rows, 2) == "best policy: trial 2 (success 50%, cost 0.310)"
     robot = [row | UNMEASURED for row in rows]
-    assert best_line(robot, 1) == "best policy: trial 1 (cost 0.200 in 1 of the episodes)"
+    assert best_line(robot, 1) == (
+        "best policy: trial 1 (cost 0.200, ran in 1 episode); that of trial 3 has not run yet: trial=last takes it"
+    )
     assert best_line(robot, 3) == "best policy: trial 3 (not run yet)"
 
 
@@ -150,7 +163,7 @@ def test_what_will_be_done_and_how_to_go_on(tmp_path: Path) -> None:
     assert f"pegasus-train 'resume={run}' goes on" in stopped(run)
     (run / "episodes").mkdir()
     (run / "episodes" / "0001.npz").touch()
-    assert "every finished episode is kept" in stopped(run)
+    assert "all rows of every episode are kept" in stopped(run)
 
 
 class Watch:

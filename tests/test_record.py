@@ -250,6 +250,11 @@ def ran(*rows: tuple[int, float | None, str]) -> list[dict[str, Any]]:
     ]
 
 
+def other_cost(rows: list[dict[str, Any]], since: int) -> list[dict[str, Any]]:
+    """Rows whose costs are of another function from that trial on."""
+    return [row | {"cost_since": since} if row["trial"] >= since else row for row in rows]
+
+
 @pytest.mark.parametrize(
     ("rows", "last", "best"),
     [
@@ -266,6 +271,9 @@ def ran(*rows: tuple[int, float | None, str]) -> list[dict[str, Any]]:
         (ran((0, 0.0, "horizon"), (1, 0.5, "horizon")), ran((2, 0.4, "horizon"))[0], 2),
         (ran((0, 0.0, "horizon"), (1, 0.5, "horizon")), ran((2, 0.4, "error"))[0], 1),
         (ran((0, 0.0, "horizon"), (1, 0.5, "horizon")), ran((2, 0.6, "terminated"))[0], 1),
+        (other_cost(measured((1.0, 0.1), (0.9, 0.2), (0.0, 0.9), (0.0, 0.8)), 3), None, 4),  # costs of two functions
+        (other_cost(ran((0, 0.9, "horizon"), (1, 0.2, "horizon"), (2, 0.7, "horizon")), 3), None, 2),
+        (other_cost(ran((0, 0.9, "horizon"), (1, 0.2, "horizon")), 2), ran((2, 0.7, "horizon"))[0], 1),
     ],
 )
 def test_the_best_policy(rows: list[dict[str, Any]], last: dict[str, Any] | None, best: int) -> None:

@@ -172,7 +172,7 @@ def test_ctrl_c_in_the_middle_of_an_episode(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert (process.returncode, "Traceback" in err) == (130, False), err
-    assert err.splitlines()[-1] == "stopped; every finished episode is kept, pegasus-train resume=run goes on"
+    assert err.splitlines()[-1] == "stopped; all rows of every episode are kept, pegasus-train resume=run goes on"
     assert asked(tmp_path)[-1] == "close"
 
 

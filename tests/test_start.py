@@ -91,9 +91,10 @@ def test_a_cost_is_a_function_of_an_observation(tmp_path: Path, capfd: pytest.Ca
     pg.train(resume=run, settings={"trials": 3}, cost=half)
     told = [line for line in capfd.readouterr().err.splitlines() if "today's cost" in line]
     numbers = [float(found) for found in re.findall(r"(\d*\.\d+)", told[0])]
-    assert "costs of trials 1 to 2 were counted with another one" in told[0]
+    assert "those of trials 1 to 2 were counted with another one" in told[0]
     np.testing.assert_allclose(numbers, [np.mean(expected), np.mean(expected) / 2], rtol=1e-2)
-    assert len(store.trials(run)) == 3
+    pg.train(resume=run, settings={"trials": 4}, cost=half)
+    assert [store.cost_since(row) for row in store.trials(run)] == [1, 1, 3, 3]
 
 
 @pytest.mark.slow

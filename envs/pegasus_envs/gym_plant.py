@@ -15,6 +15,7 @@ from gymnasium.envs.registration import load_env_creator
 
 from pegasus_envs.plant import filled
 
+LARGEST = 1e15  # of a reading: squares of larger ones overflow single precision in a fit
 RESETS = 100  # from which the distribution of starts is estimated where it is not given
 
 
@@ -236,14 +237,14 @@ def first(answer: Any) -> Any:
 
 
 def observed(x: Any, states: int, names: Sequence[str] = ()) -> np.ndarray:
-    """A copy of an observation [D], in single precision. Raises ValueError where it is not one, or not finite."""
+    """A copy of an observation [D], in single precision. Raises ValueError where it is not one, or not below LARGEST."""
     try:
         x = np.array(x, np.float32)
     except (TypeError, ValueError) as error:
         raise ValueError(f"it observed {type(x).__name__}; expected {states} numbers") from error
     if x.shape != (states,):
         raise ValueError(f"it observed an array of shape {x.shape}; expected ({states},)")
-    for entry in np.flatnonzero(~np.isfinite(x)):
+    for entry in np.flatnonzero(~(np.abs(x) < LARGEST)):
         called = f", {names[int(entry)]}," if names else ""
         raise ValueError(f"entry {entry} of its observation{called} is {x[entry]}")
     return x

@@ -94,7 +94,8 @@ def drive(seed: int, act: Callable[[int, np.ndarray], Any], task: Task) -> Episo
                 x, sent, over = task.environment.step(u)
                 rows.append((x, sent))
                 if over:
-                    ended = over
+                    # A time limit that is the horizon ends nothing early.
+                    ended = "horizon" if (over, t + 1) == ("truncated", task.horizon) else over
                     break
     except BaseException as raised:
         interrupt.let_go(task.environment.close)

@@ -137,7 +137,7 @@ def _of_today(words: Sequence[str]) -> list[str]:
 
 def _goes_on() -> str:
     """How to go on with what was begun."""
-    return f"; every finished episode is kept, resume={cli_train.begun[0]} goes on" if cli_train.begun else ""
+    return f"; all rows of every episode are kept, resume={cli_train.begun[0]} goes on" if cli_train.begun else ""
 
 
 def _always() -> list[str]:

@@ -57,7 +57,7 @@ class Job(NamedTuple):
 
 def sweep() -> None:
     """Entry point of pegasus-sweep."""
-    main(handle, SWEEP, stopped="every finished episode is kept, pegasus-train resume=RUN goes on with a run")
+    main(handle, SWEEP, stopped="all rows of every episode are kept, pegasus-train resume=RUN goes on with a run")
 
 
 def values(text: str) -> list[str]:

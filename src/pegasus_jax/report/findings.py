@@ -9,6 +9,7 @@ from importlib import metadata
 from typing import Any, NamedTuple
 
 from pegasus_jax.report.read import Look, coverage
+from pegasus_jax.runs.store import cost_since
 from pegasus_jax.runs.stuck import AT_LIMITS, stuck
 
 TOO_SURE, TOO_UNSURE = 2.0, 0.5  # errors of a model, in what it predicts for them
@@ -48,6 +49,9 @@ def _measured(found: Look) -> Iterator[Finding]:
     if found.rows and all(row.get("mean_cost") is None for row in found.rows):
         means = "Cost and success are of each trial's own episode, one sample of the policy of the trial before."
         yield Finding("note", "policies were not evaluated (eval_episodes=0)", means)
+    if found.rows and (since := cost_since(found.rows[-1])) > 1:
+        means = "Costs before it are of another function: curves jump there, and no earlier policy can be the best one."
+        yield Finding("note", f"the cost was changed before trial {since}", means)
     if found.rows and all(row.get("objective_fresh") is None for row in found.rows):
         yield Finding("note", "no policy was learned yet", "Every episode so far was of random controls.")
 

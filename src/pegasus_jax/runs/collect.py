@@ -1,5 +1,6 @@
 """Line 3 of Alg. 1 as a job does it: the episodes of a trial, each durable before anything is learned from it."""
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -87,6 +88,15 @@ def costed(job: Job, ran: Episode, trial: int) -> Episode:
     return ran._replace(trajectory=ran.trajectory._replace(cost=cost))
 
 
+def costs_since(run: Path, task: Task, done: int, say: Callable[[str], None]) -> int:
+    """The first trial with costs of today's function, of a run of which `done` trials are there; a change is told."""
+    rows = store.readable_trials(run)[0][:done]
+    if note := other_cost(run, task):
+        say(note)
+        return done + 1
+    return store.cost_since(rows[-1]) if rows else 1
+
+
 def other_cost(run: Path, task: Task) -> str | None:
     """What to say where an environment's newest episode costs something else today: its user has changed the cost."""
     stored = store.numbered(run / "episodes", ".npz")
@@ -103,7 +113,8 @@ def other_cost(run: Path, task: Task) -> str | None:
         return None
     return (
         f"the episode of trial {stored[-1]} cost {np.mean(before):.3g} a step, and with today's cost"
-        f" {np.mean(now):.3g}: the costs of trials 1 to {stored[-1]} were counted with another one"
+        f" {np.mean(now):.3g}: those of trials 1 to {stored[-1]} were counted with another one, and no longer choose"
+        " the best policy"
     )
 
 

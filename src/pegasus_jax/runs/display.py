@@ -229,7 +229,7 @@ def stopped(home: Path) -> str:
         return f"stopped before the first trial of {home}; the same command begins again"
     if not any(home.glob("**/episodes/*.npz")):
         return f"stopped before the first episode had ended; {typed(['pegasus-train', f'resume={home}'])} goes on"
-    return f"stopped; every finished episode is kept, {typed(['pegasus-train', f'resume={home}'])} goes on"
+    return f"stopped; all rows of every episode are kept, {typed(['pegasus-train', f'resume={home}'])} goes on"
 
 
 def summary(rows: Sequence[dict[str, Any]], trials: int, best: int | None = None) -> str:
@@ -245,7 +245,7 @@ def summary(rows: Sequence[dict[str, Any]], trials: int, best: int | None = None
         f"{first['plant_seconds']:.1f} s of plant",
         f"{executed(rows)}: cost {_mean(rows, 'episode_cost'):.3f}{outcome(rows)}",
         learned(rows),
-        f"best so far: trial {best}" if best not in (None, first["trial"]) else "",
+        "" if best in (None, first["trial"], judged(first)) else f"best so far: trial {best}",
         f"{count_solved(rows)} of {len(rows)} seeds solved" if measured and several else "",
         f"model errors {np.median(errors):.1f} times as large as predicted" if errors else "",
         skipped(rows),
@@ -253,6 +253,11 @@ def summary(rows: Sequence[dict[str, Any]], trials: int, best: int | None = None
         f"({waited(first['seconds'])})",
     ]
     return "  ".join(part for part in parts if part)
+
+
+def judged(row: dict[str, Any]) -> int:
+    """The trial whose policy a row has measured: its own, where that was evaluated, else the one that just ran."""
+    return row["trial"] if row["mean_cost"] is not None or "policy" not in row else row["policy"]
 
 
 def waited(seconds: dict[str, float]) -> str:
@@ -330,10 +335,11 @@ def best_line(rows: Sequence[dict[str, Any]], trial: int) -> str:
     row = rows[trial - 1] if trial else {"mean_cost": None}  # 0: the policy that the first episode ran
     own = [other["episode_cost"] for other in rows if other.get("policy") == trial and (trial or not other["random"])]
     if row["mean_cost"] is not None:
-        known = f"success {row['success_rate']:.0%}, cost {row['mean_cost']:.3f}"
-    else:
-        known = f"cost {np.mean(own):.3f} in {len(own)} of the episodes" if own else "not run yet"
-    return f"best policy: trial {trial} ({known})"
+        return f"best policy: trial {trial} (success {row['success_rate']:.0%}, cost {row['mean_cost']:.3f})"
+    known = f"cost {np.mean(own):.3f}, ran in {len(own)} episode{'s'[: len(own) > 1]}" if own else "not run yet"
+    newest, ran = max(row.get("trial", 0) for row in rows), {row.get("policy") for row in rows}
+    more = "" if newest in {trial, *ran} else f"; that of trial {newest} has not run yet: trial=last takes it"
+    return f"best policy: trial {trial} ({known}){more}"
 
 
 def _mean(rows: Sequence[dict[str, Any]], name: str) -> float | None:

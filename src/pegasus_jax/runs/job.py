@@ -34,6 +34,7 @@ class Job(NamedTuple):
     display: Display
     writer: Writer
     logs: Logs = NONE  # trial 1 of a run that has some
+    cost_since: Sequence[int] = ()  # of each seed, where its user has changed the cost: the first trial with today's
 
     def random(self, trial: int) -> bool:
         """Whether the episode of this trial is of random controls."""

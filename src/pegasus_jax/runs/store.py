@@ -322,10 +322,11 @@ def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None =
     often, and of these the one with the lowest mean cost;
     `last_episode` is one more than there are rows. What a fault or a person cut short does not count. A policy that
     never ran is chosen only where none ran: the last one. Among equals it is the latest. With `first` 0 one that was
-    learned before the first episode is among them.
+    learned before the first episode is among them. Costs are compared with costs of the same function only: the newest.
     """
     from pegasus_jax.episode import CUT
 
+    rows = [row for row in rows if cost_since(row) == cost_since(rows[-1])]
     if all(row["mean_cost"] is not None and row["success_rate"] is not None for row in rows):
         return max(rows, key=lambda row: (row["success_rate"], -row["mean_cost"], row["trial"]))["trial"]
     own: dict[int, list[tuple[float, ...]]] = {}  # of each policy, (failed, broke the constraint, cost) of its episodes
@@ -337,6 +338,11 @@ def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None =
     if not own:
         return rows[-1]["trial"]
     return min(own, key=lambda policy: (*np.mean(own[policy], 0), -policy))
+
+
+def cost_since(row: dict[str, Any]) -> int:
+    """The first trial whose costs are of the same function as those of a row of trials.jsonl."""
+    return row.get("cost_since", 1)
 
 
 def phases(row: dict[str, Any]) -> dict[str, float]:

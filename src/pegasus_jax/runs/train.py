@@ -24,7 +24,7 @@ from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.logs.read import Logged
 from pegasus_jax.runs import begin, checkpoint, config_io, logged, restore, store, tracked, writers
 from pegasus_jax.runs.beside import beside
-from pegasus_jax.runs.collect import collected, other_cost, stacked
+from pegasus_jax.runs.collect import collected, costs_since, stacked
 from pegasus_jax.runs.display import learned
 from pegasus_jax.runs.evaluation import UNMEASURED, evaluate, kept_to, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
@@ -98,10 +98,9 @@ def train_seeds(
             logged.save(run, begun.episodes(), task)
         for run in folders if resume else ():
             restore.same(run, task)
-            if note := other_cost(run, task):
-                say(note)
         stored = restore.together(folders, job.experiment, say) if resume else None
         done = None if stored is None else int(stored.trial[0])
+        job = job._replace(cost_since=[costs_since(run, task, done, say) for run in folders if done])
         states = first_states(job, stored, changed=(config.fit, config.search) != (before.fit, before.search))
         if stored is None:
             states = begin.begun(states, config, folders[0])
@@ -128,9 +127,10 @@ def learn(job: Job, states: RunState, done: int | None = None) -> RunState:
     if done is None and (first_search(job.config) == 0 or begins_with_policy(job.config)):
         job.writer.ready(states)
     before: list[Row] = []
+    changed = [{"cost_since": since} if since > 1 else {} for since in job.cost_since or [1] * len(job.seeds)]
 
     def kept(trial: int, states: RunState, result: Result) -> None:
-        rows = result()
+        rows = [row | since for row, since in zip(result(), changed, strict=True)]
         job.writer.trial(trial, states, rows)
         job.display.trial(rows)
         for line in stuck(before, rows):
