@@ -19,7 +19,7 @@ LAYERS = {
     1: "config_models shapes sharding task vectorized math.",
     2: "config_plant config_policies memory",
     3: "config models. imagine. episode",
-    4: "presets policies. learn.",
+    4: "presets policies. learn. config_used",
     5: "tasks. pilco. experiment",
     6: "assembly. logs.",
     7: "runs.",

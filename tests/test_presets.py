@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from pegasus_jax import preset
+from pegasus_jax import config_used, preset
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import KINDS, TASKS, Config
 from pegasus_jax.presets import ALGORITHMS, MODELS, NETWORKS, POLICIES, PRESETS, WORDS, own
@@ -161,7 +161,7 @@ def test_every_setting_is_needed_by_a_preset_a_figure_or_a_page():
 
 def test_the_method_has_few_settings():
     """Beside those that describe a plant of your own, which `Config` has as a group and --help=all in groups."""
-    plant = {*config_io.used_by()}
+    plant = {*config_used.used_by()}
     assert len(settings() - plant) <= 55
     assert plant == {
         "control_rate",
@@ -206,7 +206,7 @@ def test_the_method_has_few_settings():
         "init",
         "init_parts",
     }
-    own = [*dict.fromkeys(name.partition(".")[0] for name in config_io.used_by())]
+    own = [*dict.fromkeys(name.partition(".")[0] for name in config_used.used_by())]
     own = [name for name in own if name != "explore"]
     assert [field.name for field in dataclasses.fields(Config)][-len(own) :] == own
 

@@ -1,11 +1,15 @@
 """The command line's words: every public spelling means what it says, and a wrong one ends in one useful line."""
 
 import dataclasses
+from pathlib import Path
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import pegasus_jax as pg
+from pegasus_jax import config_used
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import BNN, KINDS, MLP, RBF, Analytic, Config, Lagrangian, Period, Search
@@ -81,7 +85,7 @@ SPELLINGS = [
 
 @pytest.mark.parametrize(("word", "key", "expected"), SPELLINGS)
 def test_a_setting_changes_itself_and_nothing_else(word, key, expected):
-    users = config_io.used_by().get(key, ("cartpole",))
+    users = config_used.used_by().get(key, ("cartpole",))
     chosen, default = (config_io.leaves(parse(f"task={users[0]}", *words)) for words in ([word], []))
     assert chosen[key] == expected
     assert type(chosen[key]) is type(expected)
@@ -130,7 +134,7 @@ def test_every_setting_has_a_spelling():
     """Its own default, written as the help text writes it, changes nothing; and the help names each."""
     spelled = {shown for shown, _ in config_io.described(CARTPOLE).values()}
     for key, default in config_io.leaves(CARTPOLE).items():
-        if key not in config_io.used_by():
+        if key not in config_used.used_by():
             assert parse(f"{key}={shown(default)}") == CARTPOLE
         if key not in ("task", *(f"{section}.kind" for section in KINDS)):
             assert f"{key}={shown(default)}" in spelled
@@ -388,3 +392,11 @@ def test_settings_that_need_each_other_are_changed_together(words):
     """In either order; the first alone is impossible beside the paper's defaults."""
     chosen = parse("algorithm=paper", "search.init=better", *words)
     assert (chosen.search.init, chosen.search.refine_fraction) == ("fresh", 1)
+
+
+@pytest.mark.parametrize("changed", [{"horizon": 8}, {"dt": 0.02}, {"success": 0.5}, {"env": "Pendulum-v1"}])
+def test_a_config_from_python_is_refused_what_a_word_is(changed: dict[str, Any], tmp_path: Path) -> None:
+    for use in (pg.build, lambda config: pg.train(config, out=tmp_path / "run")):
+        with pytest.raises(ConfigError, match=rf"{next(iter(changed))}=.* is of no use with task=cartpole"):
+            use(Config(task="cartpole", **changed))
+    assert not any(tmp_path.iterdir())

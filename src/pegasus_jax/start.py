@@ -96,10 +96,12 @@ def train(
 
 
 def _config_of(config: Config | str | None, given: dict[str, Any]) -> Config:
+    from pegasus_jax import config_used
     from pegasus_jax.runs import config_io
 
     if isinstance(config, Config):
-        config_io.check_used(config.task, given)
+        config_used.check_config(config)
+        config_used.check_used(config.task, given)
         return config_io.override(config, config_io.values(config_io.without_random(given)))
     if config is not None and not isinstance(config, str):
         kind = type(config).__name__
@@ -126,6 +128,7 @@ def going_on(home: Path, changes: dict[str, Any]) -> Asked:
 
     A function, which from Python takes the place of one that nobody else can import, is the caller's word.
     """
+    from pegasus_jax import config_used
     from pegasus_jax.runs import config_io, store
 
     if wrong := sorted(key for key, value in changes.items() if not (_changeable(key) or callable(value))):
@@ -137,7 +140,7 @@ def going_on(home: Path, changes: dict[str, Any]) -> Asked:
     first = store.existing(next(iter(runs.values()), home))
     mjcf = changes.pop("mjcf", None)
     config = config_io.override(config_io.load(first / "config.yaml"), config_io.values(changes))
-    config_io.check_used(config.task, changes)
+    config_used.check_used(config.task, changes)
     _one_environment(config, len(runs))
     return Asked(config, home, runs or {config.seed: home}, first, mjcf)
 

@@ -14,6 +14,7 @@ from pegasus_jax import episode, tasks
 from pegasus_jax.assembly.pieces import drawing_rates, dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import limits, refines_successes, search_of
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.config_used import check_config
 from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.imagine import visited
 from pegasus_jax.learn.data import room
@@ -39,10 +40,11 @@ def build(config: settings.Config, mesh: Mesh | None = None, logged: int = 0) ->
     """The experiment of a config, with room for `logged` rows of data besides those of the trials.
 
     Cached: the same config gives the same functions, which compile once, and the same environment, which is opened
-    once. Raises ConfigError for what is no config.
+    once. Raises ConfigError for what is no config, and for a setting that its task does not use.
     """
     if not isinstance(config, settings.Config):
         raise ConfigError(f"build takes a Config, not a {type(config).__name__}; compose(config, task) takes both")
+    check_config(config)
     return _built(config, mesh, logged)
 
 

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
-from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,8 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from pegasus_jax.checks import FUNCTION, ConfigError, did_you_mean, expected, shown
-from pegasus_jax.config import KINDS, TASKS, Config, Explore, check_spread, uses
+from pegasus_jax.config import KINDS, TASKS, Config, check_spread, uses
+from pegasus_jax.config_used import check_used, leaves
 from pegasus_jax.presets import WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.removed import refuse, today
@@ -71,32 +71,6 @@ def parse(words: Mapping[str, Any], options: Sequence[str] = ()) -> Config:
     return changed
 
 
-def check_used(task: str, given: Mapping[str, Any]) -> None:
-    """Raises ConfigError for a setting of a plant's own that is of no use with this task."""
-    of_some = used_by()
-    for key, value in given.items():
-        if task not in of_some.get(key, (task,)):
-            raise ConfigError(
-                f"{key}={shown(value)} is of no use with task={task}; the nearest task that uses it is"
-                f" task={_nearest_of(task, of_some[key])}"
-            )
-
-
-def used_by() -> dict[str, tuple[str, ...]]:
-    """Setting -> the tasks that use it, of those settings that describe a plant, or how it is explored."""
-    found: dict[str, tuple[str, ...]] = {}
-    for f in dataclasses.fields(Config):
-        if f.metadata.get("of"):
-            using, inner = tuple(task for task in TASKS if uses(task, f.name)), getattr(Config, f.name)
-            names = leaves(inner, f"{f.name}.") if dataclasses.is_dataclass(inner) else [f.name]
-            found |= dict.fromkeys(names, using)
-    return found | {f"explore.{f.name}": TASKS for f in dataclasses.fields(Explore) if f.metadata.get("of")}
-
-
-def _nearest_of(task: str, choices: Sequence[str]) -> str:
-    return (get_close_matches(task, choices, n=1) or [choices[0]])[0]
-
-
 def _with_arguments(words: Mapping[str, Any]) -> dict[str, Any]:
     """The words, with those of env_args.NAME=VALUE as one list."""
     prefix = "env_args."
@@ -125,18 +99,6 @@ def override(config: Config, changes: dict[str, Any]) -> Config:
         if key not in known:
             raise ConfigError(f"{key} is not a setting; {_hint(key, [*known])}")
     return _changed(config, changes, "")
-
-
-def leaves(node: Any, prefix: str = "") -> dict[str, Any]:
-    """Dotted name -> value of every setting under a config dataclass."""
-    found: dict[str, Any] = {}
-    for f in dataclasses.fields(node):
-        value = getattr(node, f.name)
-        if dataclasses.is_dataclass(value):
-            found |= leaves(value, f"{prefix}{f.name}.")
-        else:
-            found[prefix + f.name] = value
-    return found
 
 
 def plain(config: Config) -> dict[str, Any]:
