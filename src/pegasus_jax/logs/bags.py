@@ -43,7 +43,7 @@ def of_bag(path: Path, names: Names, columns: Sequence[str]) -> Table:
     grid = series[said[names.observation[0]].name][0]
     table: dict[str, np.ndarray] = {"t": grid}
     for name, turning in zip(names.observation, names.turning, strict=True):
-        column, factor = said[name]
+        column, factor, _ = said[name]
         table[column] = interpolated(grid, *series[column], turning, abs(2 * np.pi / factor))
     for name in names.control:
         t, values = series[said[name].name]

@@ -1,14 +1,17 @@
 """Which columns of a table are the observation, the controls, the time and the episode."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from pegasus_jax.checks import ConfigError, did_you_mean, shown
+from pegasus_jax.logs import times, units
 from pegasus_jax.logs.table import EPISODE, TIMES, Names, Table, plain
 
 SETTING = "data_columns"
+SHOWN = 8  # names of columns in a note
 
 
 class Column(NamedTuple):
@@ -16,6 +19,10 @@ class Column(NamedTuple):
 
     name: str
     factor: float = 1.0
+    said: bool = False  # whether its user gave the factor
+
+    def __str__(self) -> str:
+        return f"{self.name}*{self.factor:.12g}" if self.said or self.factor != 1 else self.name
 
 
 class Layout(NamedTuple):
@@ -59,13 +66,13 @@ def _column(entry: str, text: str) -> Column:
     if not star:
         return Column(text)
     try:
-        return Column(name, float(factor))
+        return Column(name, float(factor), said=True)
     except ValueError:
         raise ConfigError(f"{SETTING}: {entry} is not COLUMN*FACTOR; for example x0=angle*0.0174533") from None
 
 
 def layout(table: Table, names: Names, columns: Sequence[str]) -> tuple[Layout, str]:
-    """Where everything is in a table, and a note where that was decided by the columns' order, or "".
+    """Where everything is in a table, and a note where columns' order or a map that names others decided it, or "".
 
     By the map; else by the names; else the observation in order, then the controls. Raises ConfigError where it cannot
     be told.
@@ -73,9 +80,12 @@ def layout(table: Table, names: Names, columns: Sequence[str]) -> tuple[Layout, 
     said, known = mapped(columns, names), (*names.observation, *names.control)
     own = matched([name for name in table.names if name not in {*TIMES, EPISODE} - {*known}], known)
     taken = {column.name for column in said.values()} or {*own.values()}
-    time = said.get("t") or _time(table.names, taken)
+    found = times.known(table.names, taken)
+    time = said.get("t") or (found and Column(*found))
     episode = said[EPISODE].name if EPISODE in said else EPISODE if EPISODE in table.names else None
-    note = ""
+    called = {column: name for name, column in own.items()}
+    other = [f"{c.name} is taken for {n}" for n, c in said.items() if called.get(c.name, n) != n]
+    note = f"by {SETTING}=, {', and '.join(other)}" if other else ""
     if not said:
         rest = [name for name in table.names if name not in (episode, time and time.name)]
         if not own:
@@ -94,9 +104,58 @@ def layout(table: Table, names: Names, columns: Sequence[str]) -> tuple[Layout, 
                 f"{table.source} has no column {column.name}, it has {', '.join(table.names)};"
                 f" {SETTING}=[...] says which is which"
             )
+    _same_units(table, said, names)
     return Layout(
         tuple(said[name] for name in names.observation), tuple(said[name] for name in names.control), time, episode
     ), note
+
+
+def _same_units(table: Table, said: Mapping[str, Column], names: Names) -> None:
+    """Raises ConfigError, with what to type, for a column whose header says another unit than the environment's."""
+    known = {**names.units, "t": "s"}
+    other = {
+        name: unit
+        for name, column in said.items()
+        if name in known and not column.said and (unit := units.of_header(column.name, known[name]))
+        if units.factor(unit, known[name]) != 1
+    }
+    for name, unit in [*other.items()][:1]:
+        scales = {name: units.factor(unit, known[name]) for name, unit in other.items()}
+        entries = {name: f"{said[name].name}*{f'{by:.6g}' if by else 'FACTOR'}" for name, by in scales.items()}
+        unknown = (
+            "" if scales[name] else f" if it is the right column, FACTOR being how many {known[name]} are 1 {unit}"
+        )
+        raise ConfigError(
+            f"{table.source}: the column {said[name].name} is in {unit}, and {name} is to be in {known[name]};"
+            f" {word({**said, **entries}, names)} makes it so{unknown}; *1 says that the header is wrong"
+        )
+
+
+def word(entries: Mapping[str, Any], names: Names) -> str:
+    """What to type for a map: name of the environment, t or episode -> an entry; in quotes where it has to be."""
+    known = (*names.observation, *names.control)
+    texts = [str(entries[name]) for name in known] + [
+        f"{name}={entries[name]}" for name in entries if name not in known
+    ]
+    quoted = [text if re.fullmatch(r"[\w./*=+-]+", text) else f'"{text}"' for text in texts]
+    all_ = f"{SETTING}=[{','.join(quoted)}]"
+    return all_ if quoted == texts else f"'{all_}'"
+
+
+def untimed(table: Table, where: Layout, names: Names, dt: float) -> str:
+    """The note on a table without a time: which of its columns nothing uses, and what to type if one looks like it."""
+    said = dict(zip((*names.observation, *names.control), (*where.observation, *where.control), strict=True))
+    unused = [name for name in table.names if name not in {where.episode, *(column.name for column in said.values())}]
+    note = f"no column t or time: rows are taken to be dt={dt:g} s apart"
+    note += f"; nothing uses {some(unused)}" if unused else ""
+    if (found := times.alike(table, unused, dt)) is None:
+        return note
+    return f"{note}; if {found[0]} is the time, {word({**said, 't': Column(*found)}, names)}"
+
+
+def some(names: Sequence[str]) -> str:
+    """The first of many names, and how many more there are."""
+    return ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
 
 
 def matched(columns: Sequence[str], names: Sequence[str]) -> dict[str, str]:
@@ -114,13 +173,6 @@ def matched(columns: Sequence[str], names: Sequence[str]) -> dict[str, str]:
         if name not in found and len(alike.get(_loose(name), ())) == 1:
             found[name] = alike[_loose(name)].pop()
     return found
-
-
-def _time(columns: Sequence[str], taken: set[str]) -> Column | None:
-    """The column of the time [s], or None. T, which may be a torque or a temperature, is time where it is first."""
-    found = [name for name in TIMES if name in columns]
-    found += [name for name in columns if name.casefold() == "time"] + [name for name in columns[:1] if name == "T"]
-    return next((Column(name) for name in found if name in TIMES or name not in taken), None)
 
 
 def _loose(name: str) -> str:

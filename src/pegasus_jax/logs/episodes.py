@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.logs.columns import SETTING, Column, Layout, numbers
+from pegasus_jax.logs.columns import SETTING, Column, Layout, numbers, untimed
 from pegasus_jax.logs.table import Table, names_of
 from pegasus_jax.math.circles import to_state
 from pegasus_jax.memory import measured
@@ -28,6 +28,7 @@ class Segment(NamedTuple):
     t: np.ndarray  # [L+1] [s]
     x: np.ndarray  # [L+1, D] states, as far as they are measured
     u: np.ndarray  # [L, U] what was sent at the times 0..L-1
+    begins: bool = True  # whether its first row is its episode's
 
 
 def segments(table: Table, where: Layout, task: Task, control: str, note: Note) -> Iterator[Segment]:
@@ -42,7 +43,7 @@ def segments(table: Table, where: Layout, task: Task, control: str, note: Note) 
     for row in np.flatnonzero(~np.isfinite(t)):
         raise ConfigError(f"{table.where(row)}: its time is missing")
     if where.time is None:
-        note(f"no column t or time: rows are taken to be dt={task.dt:g} s apart")
+        note(untimed(table, where, names_of(task), task.dt))
     _within_limits(table, sent, where, task)
     begins = np.diff(t) < 0
     if where.episode is not None:
@@ -54,7 +55,8 @@ def segments(table: Table, where: Layout, task: Task, control: str, note: Note) 
             cuts = _cuts(table, rows, t[rows], (observed[rows], u), task, note)
             for part in np.split(np.arange(len(rows)), cuts):
                 if len(part) > 1:
-                    yield Segment(t[rows][part], to_state(observed[rows][part], task.circles), u[part[:-1]])
+                    x = to_state(observed[rows][part], task.circles)
+                    yield Segment(t[rows][part], x, u[part[:-1]], begins=bool(part[0] == 0))
 
 
 def _cuts(
@@ -85,7 +87,10 @@ def _cuts(
 
 
 def _radians(table: Table, rows: np.ndarray, observed: np.ndarray, where: Layout, task: Task) -> None:
-    """Raises ConfigError for an angle that cannot be in radians, and for a pair that is no cosine and sine."""
+    """Raises ConfigError for an angle that cannot be in radians, and for a pair that is no cosine and sine.
+
+    An angle that starts within two turns and never jumps may be one of degrees, or of an encoder that goes on and on.
+    """
     for pair in task.circles:
         radius = np.hypot(*observed[:, pair].T)
         for row in np.flatnonzero(np.abs(radius - 1) > ROUND)[:1]:
@@ -139,7 +144,7 @@ def periods(one: Segment, task: Task, note: Note) -> Segment:
     note(f"a row every {np.median(steps):.3g} s or so: resampled to dt={task.dt:g}")
     if np.any(one.u != one.u[held][within]):
         note(f"controls change within periods of dt={task.dt:g}; those at their beginning are taken")
-    return Segment(grid, x, one.u[held])
+    return Segment(grid, x, one.u[held], one.begins)
 
 
 def with_rates(x: np.ndarray, task: Task) -> np.ndarray:

@@ -27,6 +27,8 @@ class Logged(NamedTuple):
 
     trajectory: Trajectory  # of L <= H control periods, without a length
     source: str
+    columns: tuple[str, ...] = ()  # [O+U] of the file, of which its observation and its controls are
+    begins: bool = True  # whether its first row is that of an episode
 
 
 def load_logs(
@@ -54,20 +56,21 @@ def read(
 ) -> tuple[list[Logged], list[str]]:
     """(the episodes of logs, in parts of at most a horizon; notes on what was decided, one line each)."""
     notes: dict[str, list[str]] = {}  # text -> the files of which it is true
-    found: list[tuple[Segment, str]] = []
+    found: list[tuple[Segment, str, tuple[str, ...]]] = []
     names = names_of(task)
     for table in tables(files, names, columns):
 
         def note(text: str, source: str = table.source) -> None:
             notes.setdefault(text, []).append(source)
 
-        where, by_order = layout(table, names, columns)
-        if by_order:
-            note(by_order)
+        where, decided = layout(table, names, columns)
+        if decided:
+            note(decided)
         own = [periods(one, task, note) for one in segments(table, where, task, control, note)]
         if not own:
             note("no two rows follow each other; left out")
-        found += [(one, table.source) for one in own]
+        used = tuple(map(str, (*where.observation, *where.control)))
+        found += [(one, table.source, used) for one in own]
     if not found:
         raise ConfigError(f"data={','.join(files)} has no episode: no two rows follow each other")
     told = [
@@ -100,7 +103,7 @@ def _table(path: Path, names: Names, columns: Sequence[str]) -> Table:
     raise ConfigError(f"data={path} is no log that we read; expected .csv, .npz, {', '.join(bags.SUFFIXES)}")
 
 
-def _trajectories(found: list[tuple[Segment, str]], task: Task) -> list[Logged]:
+def _trajectories(found: list[tuple[Segment, str, tuple[str, ...]]], task: Task) -> list[Logged]:
     """Parts of at most H periods, each with its costs and what is remembered at its start.
 
     Raises ConfigError where a cost is not a finite number.
@@ -112,7 +115,7 @@ def _trajectories(found: list[tuple[Segment, str]], task: Task) -> list[Logged]:
     def known(whole: Trajectory) -> tuple[Array, Array | None]:
         return episode.costs(task, whole), recall.replay(task.memory, whole)
 
-    for one, source in found:
+    for one, source, columns in found:
         x, u, m = with_rates(one.x, task).astype(kind), one.u.astype(kind), None
         for i in range(0, len(u), size):
             rows = u[i : i + size]
@@ -121,5 +124,6 @@ def _trajectories(found: list[tuple[Segment, str]], task: Task) -> list[Logged]:
             for (row,) in np.argwhere(~np.isfinite(costs[: len(rows)]))[:1]:
                 raise ConfigError(f"{source}: the cost of the observation {part.x[row + 1].tolist()} is {costs[row]}")
             start, m = (None, None) if remembered is None else (remembered[0], remembered[len(rows)])
-            parts.append(Logged(part._replace(cost=costs[: len(rows)].astype(kind), memory=start), source))
+            whole = part._replace(cost=costs[: len(rows)].astype(kind), memory=start)
+            parts.append(Logged(whole, source, columns, one.begins and i == 0))
     return parts

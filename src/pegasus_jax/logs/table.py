@@ -11,6 +11,7 @@ import numpy as np
 
 from pegasus_jax import memory
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.logs.units import said
 from pegasus_jax.math import circles
 from pegasus_jax.task import Task
 
@@ -43,7 +44,7 @@ class Names(NamedTuple):
     observation: tuple[str, ...]  # [O] the user's observation
     control: tuple[str, ...]  # [U]
     turning: tuple[bool, ...]  # [O] whether an entry is an angle
-    dt: float  # [s] from row to row, where the log has no time
+    units: Mapping[str, str] = MappingProxyType({})  # name -> the unit that it is in, as far as it is known
 
 
 def names_of(task: Task) -> Names:
@@ -57,7 +58,11 @@ def names_of(task: Task) -> Names:
         observed |= dict(zip(pair, (cosine, sine), strict=True))
     paired = {entry for pair in task.circles for entry in pair}
     turning = tuple(i not in paired and place[i] in task.angles for i in range(size))
-    return Names(tuple(observed[i] for i in range(size)), tuple(map(plain, task.control_names)), turning, task.dt)
+    units = {plain(name): unit for name in (*task.state_names, *task.control_names) if (unit := said(name))}
+    angles = {observed[i]: "rad" for i in range(size) if turning[i]}
+    return Names(
+        tuple(observed[i] for i in range(size)), tuple(map(plain, task.control_names)), turning, angles | units
+    )
 
 
 def plain(name: str) -> str:
@@ -135,8 +140,8 @@ def of_arrays(source: str, arrays: Mapping[str, Any], names: Names) -> Table:
     for name in TIMES:  # of controls: the last observation comes a period after the last of them
         if name in columns and size > 2 and np.isnan(columns[name][-1]):
             columns[name][-1] = 2 * columns[name][-2] - columns[name][-3]
-    if not {*TIMES} & {*columns}:
-        columns["t"] = np.arange(size) * float(np.ravel(arrays.get("dt", names.dt))[0])
+    if "dt" in arrays and not {*TIMES} & {*columns}:  # as in the episodes that we write
+        columns["t"] = np.arange(size) * float(np.ravel(arrays["dt"])[0])
     return Table(source, tuple(columns), np.column_stack([*columns.values()]), np.arange(size))
 
 

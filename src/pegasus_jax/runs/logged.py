@@ -16,6 +16,7 @@ from pegasus_jax.checks import RunError
 from pegasus_jax.config import Config
 from pegasus_jax.episode import padded
 from pegasus_jax.experiment import Experiment
+from pegasus_jax.logs import compare
 from pegasus_jax.logs.read import Logged, read
 from pegasus_jax.runs import store
 from pegasus_jax.runs.files import write_whole
@@ -89,7 +90,9 @@ def read_config(config: Config, task: Task) -> tuple[list[Logged], list[str]]:
     files = len({one.source for one in found})
     return found, [
         f"logs of {rows(found) * task.dt:g} s from {files} file{'s' * (files > 1)} are the first data",
+        compare.ranges(found, task),
         *notes,
+        *compare.far(found, task),
     ]
 
 
