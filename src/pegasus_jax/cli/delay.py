@@ -1,5 +1,6 @@
 """The command pegasus-delay: how many periods pass from a control to what is observed of it."""
 
+import sys
 from collections.abc import Sequence
 
 from pegasus_jax.checks import ConfigError, whole
@@ -12,10 +13,13 @@ pegasus-delay env=ID [amplitude=0.1] [periods=200] [setting=value ...]     measu
 Drives the environment by random controls, small ones, and says after how many control periods the first change is
 observed: of the motor's driver, the wires, the sensors and their filters together. Takes the words of pegasus-train
 besides; env_args.*, angles=, dt=, control_low= and control_high= are of use, and no cost is needed. Nothing is written.
+Before anything moves it says which controls it will send.
 
   amplitude=0.1         of the controls, as a fraction of half their range, above and below rest: 0, or the limit next
-                        to it. Each period has the one or the other. Too small, and no change is found
-  periods=200           control periods to drive, in several episodes if horizon= is less; each ends with one at rest
+                        to it. Each period has the one or the other. The range clips them: of [-1, 3] V amplitude=1
+                        sends -1 or 2 V. control_rate= makes them smaller. Too small, and no change is found
+  periods=200           control periods to drive, in several episodes if horizon= is less; each ends with one at rest.
+                        Where episodes end early others follow, for three times as many periods at most
   most=8                the greatest delay that is looked for
 
 A delay of 0 periods is the usual one of a simulation: a control changes what is read at the end of its own period.
@@ -40,9 +44,11 @@ def handle(words: Sequence[str]) -> None:
     amplitude = _number("amplitude", options.get("amplitude", "0.1"))
     periods, most = (whole(name, options.get(name, default)) for name, default in (("periods", "200"), ("most", "8")))
     config = config_io.parse({"task": "gym", **rest}, options=MORE["pegasus-delay"])
-    from pegasus_jax.runs.delay import measure, told
+    from pegasus_jax.runs.delay import announced, measure, planned, told
 
-    print(told(measure(config, amplitude, periods, most)))
+    plan = planned(config, amplitude, periods, most)
+    print(announced(plan), file=sys.stderr, flush=True)
+    print(told(measure(plan)))
 
 
 def _number(name: str, text: str) -> float:

@@ -39,7 +39,7 @@ def delay_of(episodes: Sequence[tuple[np.ndarray, np.ndarray]], angles: Sequence
     if not episodes:
         raise ValueError("there are no episodes")
     used = [(np.asarray(x, float), np.asarray(u, float)) for x, u in episodes if len(u) > most + 1]
-    rows, needed = sum(len(u) - most for _, u in used), enough(np.shape(episodes[0][1])[1], most)
+    rows, needed = rows_of([len(u) for _, u in used], most), enough(np.shape(episodes[0][1])[1], most)
     if rows < needed:
         raise ValueError(f"{rows} rows that have {most} controls before them are too few; {needed} are enough")
     lags = np.concatenate([_lagged(u, most) for _, u in used])  # [N, most + 1, U]
@@ -50,15 +50,20 @@ def delay_of(episodes: Sequence[tuple[np.ndarray, np.ndarray]], angles: Sequence
     moving = np.ptp(changes, axis=0) > 0
     base = np.column_stack([np.ones(rows), past])
     scores = np.array([_criterion(changes[:, moving], base, lags[:, d:].reshape(rows, -1)) for d in range(most + 2)])
-    weights = np.exp(-0.5 * (scores - scores.min()))
+    weights = np.exp(-0.5 * (scores - scores.min())) if moving.any() else np.eye(most + 2)[-1]  # what stands is sure
     probabilities = weights / weights.sum()
     best = int(np.argmax(probabilities))
-    return Delay(best if moving.any() and best <= most else None, probabilities, rows, echoes)
+    return Delay(best if best <= most else None, probabilities, rows, echoes)
 
 
 def enough(controls: int, most: int) -> int:
     """Rows that have `most` controls before them, of so many entries each, from which an estimate can be made."""
     return ENOUGH + controls * (most + 1)
+
+
+def rows_of(lengths: Sequence[int], most: int) -> int:
+    """Rows that have `most` controls before them in episodes of so many periods; one row alone is not used."""
+    return sum(length - most for length in lengths if length > most + 1)
 
 
 def _rows(x: np.ndarray, entries: Sequence[int], angles: Sequence[int], most: int) -> tuple[np.ndarray, np.ndarray]:
