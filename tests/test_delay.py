@@ -132,7 +132,7 @@ def test_a_delay_that_is_not_sure_is_no_answer() -> None:
     ):
         line = told(found._replace(delay=found.delay._replace(probabilities=np.array(chances))))
         assert f"the delay is not sure yet: {expected}" in line
-        assert " periods); type periods=400, and if that is not enough amplitude=0.2" in line
+        assert " periods); type periods=400, and if that is not enough amplitude=0.4" in line
         assert "sensors.delay" not in line
     sure = found.delay._replace(probabilities=np.array([0.0, 0.0, 0.91, 0.09, 0.0]), periods=2)
     assert "; give sensors.delay=2" in told(found._replace(delay=sure))
@@ -220,7 +220,7 @@ def test_an_angle_may_pass_half_a_turn() -> None:
 def test_what_cannot_be_is_one_line_and_moves_nothing() -> None:
     for words, complaint in (
         (["env=Motor-v0", "amplitude=0"], r"amplitude=0 is out of range; expected a number in \(0, 1\]"),
-        (["env=Motor-v0", "amplitude=some"], "amplitude=some is not a number; for example amplitude=0.1"),
+        (["env=Motor-v0", "amplitude=some"], "amplitude=some is not a number; for example amplitude=0.2"),
         (["env=Motor-v0", "periods=60"], r"periods=60 is out of range; expected a number in \[67, 1000000\]"),
         (["env=Motor-v0", "most=0"], "most=0 is out of range"),
         (["env=Motor-v0", "horizon=8"], r"horizon=8 is out of range; expected a number in \[9, inf"),
@@ -242,7 +242,7 @@ def test_a_robot_that_fails_is_closed() -> None:
 
 @pytest.mark.parametrize(
     ("falls", "episodes", "rows", "words"),
-    [(5, 20, 0, "most=2, or amplitude=0.05"), (2, 20, 0, "amplitude=0.05"), (10, 17, 34, "most=6, or amplitude=0.05")],
+    [(5, 20, 0, "most=2, or amplitude=0.1"), (2, 20, 0, "amplitude=0.1"), (10, 17, 34, "most=6, or amplitude=0.1")],
 )
 def test_episodes_that_are_too_short_are_refused_with_what_would_do(
     falls: int, episodes: int, rows: int, words: str

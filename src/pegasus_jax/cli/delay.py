@@ -8,14 +8,14 @@ from pegasus_jax.cli.main import main
 from pegasus_jax.cli.words import MORE
 
 DELAY = """\
-pegasus-delay env=ID [amplitude=0.1] [periods=200] [setting=value ...]     measure the delay of a robot. It moves!
+pegasus-delay env=ID [amplitude=0.2] [periods=200] [setting=value ...]     measure the delay of a robot. It moves!
 
 Drives the environment by random controls, small ones, and says after how many control periods the first change is
 observed: of the motor's driver, the wires, the sensors and their filters together. Takes the words of pegasus-train
 besides; env_args.*, angles=, dt=, control_low= and control_high= are of use, and no cost is needed. Nothing is written.
 Before anything moves it says which controls it will send.
 
-  amplitude=0.1         of the controls, as a fraction of half their range, above and below rest: 0, or the limit next
+  amplitude=0.2         of the controls, as a fraction of half their range, above and below rest: 0, or the limit next
                         to it. Each period has the one or the other. The range clips them: of [-1, 3] V amplitude=1
                         sends -1 or 2 V. control_rate= makes them smaller. Too small, and no change is found
   periods=200           control periods to drive, in several episodes if horizon= is less; each ends with one at rest.
@@ -27,7 +27,7 @@ With sensors.delay=D pegasus-train learns with that delay.
 
 examples
   pegasus-delay env=robot:Arm-v0 angles=[0]
-  pegasus-delay env=robot:Arm-v0 angles=[0] amplitude=0.2 periods=400 control_low=[-1] control_high=[1]
+  pegasus-delay env=robot:Arm-v0 angles=[0] amplitude=0.1 periods=800 control_low=[-1] control_high=[1]
 """
 
 
@@ -41,7 +41,7 @@ def handle(words: Sequence[str]) -> None:
     from pegasus_jax.runs import config_io
 
     options, rest = config_io.split(words, MORE["pegasus-delay"])
-    amplitude = _number("amplitude", options.get("amplitude", "0.1"))
+    amplitude = _number("amplitude", options.get("amplitude", "0.2"))
     periods, most = (whole(name, options.get(name, default)) for name, default in (("periods", "200"), ("most", "8")))
     config = config_io.parse({"task": "gym", **rest}, options=MORE["pegasus-delay"])
     from pegasus_jax.runs.delay import announced, measure, planned, told
@@ -56,7 +56,7 @@ def _number(name: str, text: str) -> float:
     try:
         return float(text)
     except ValueError as error:
-        raise ConfigError(f"{name}={text} is not a number; for example {name}=0.1") from error
+        raise ConfigError(f"{name}={text} is not a number; for example {name}=0.2") from error
 
 
 if __name__ == "__main__":

@@ -21,6 +21,8 @@ EPISODES = 20  # at most, that end too early to have a row
 LONGER = 3  # times the periods that were asked for, at most, where episodes end early
 # The probability from which on a delay is an answer. A single reading in N rows never gives more than 1 - 1 / sqrt(N).
 SURE = 0.9
+# Two encoders of a flexible shaft, 60 seeds of 200 periods: by .1 five were sure of a wrong delay, by .2 none.
+AMPLITUDE = 0.2
 ALL = 10**6  # periods at most
 
 
@@ -43,7 +45,7 @@ class Measured(NamedTuple):
     delay: Delay
 
 
-def planned(config: Config, amplitude: float = 0.1, periods: int = 200, most: int = MOST) -> Plan:
+def planned(config: Config, amplitude: float = AMPLITUDE, periods: int = 200, most: int = MOST) -> Plan:
     """What a config's environment will be driven by, for so many control periods; nothing moves, no cost is needed.
 
     Each control is, in each period by a new draw, one of two values: `amplitude` of half the control range above or
