@@ -538,6 +538,8 @@ WRONG_TASKS = [
     (dict(sensor_std=None), r"the task's sensor_std has shape \(\); expected \(2,\)"),
     (dict(angles=(5,)), r"the task's angles=\(5,\) has 5; its 2 states are 0 to 1"),
     (dict(horizon=10.0), r"the task's horizon=10\.0 is not a whole number"),
+    (dict(dt=-0.1), r"the task's dt=-0\.1 is no control period; expected a number of seconds above 0"),
+    (dict(dt=float("nan")), r"the task's dt=nan is no control period"),
     (
         dict(control_low=[2.0], control_high=[-2.0]),
         r"the task's limits of force are 2 and -2; expected control_low first",
@@ -549,6 +551,95 @@ WRONG_TASKS = [
 def test_a_task_whose_fields_do_not_agree_is_refused_in_one_line(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(pg.ConfigError, match=f"^{message}"):
         pg.compose(CONFIG, TASK._replace(**fields))
+
+
+UNTRACEABLE = [
+    (
+        "cost",
+        lambda x: float(x[0]),
+        "is not a JAX function: it makes a Python number or a NumPy array of x at test_api.py",
+    ),
+    ("cost", lambda x, u: np.exp(np.asarray(x)[0]), r"is not a JAX function: .*; use jax\.numpy"),
+    ("cost", lambda x: x.nothing, r"AttributeError: .*\(test_api\.py:\d+\)"),
+    ("stop", lambda x: 1.0 if x[0] > 1 else 0.0, r"is not a JAX function: .*jnp\.where instead of if"),
+]
+
+
+@pytest.mark.parametrize(("name", "function", "message"), UNTRACEABLE)
+def test_a_function_that_jax_cannot_trace_is_named_with_its_line(name: str, function: Any, message: str) -> None:
+    given: dict[str, Any] = {name: function}
+    with pytest.raises(pg.ConfigError, match=f"^{name}=.*<lambda>.* ?{message}"):
+        pg.compose(CONFIG, TASK._replace(**given))
+    if name == "cost":
+        with pytest.raises(pg.ConfigError, match=message):
+            pg.compose(CONFIG, TASK, cost=function)
+
+
+def test_a_cost_may_be_what_can_be_called_like_a_function() -> None:
+    class Far:
+        def __call__(self, x: jax.Array) -> jax.Array:
+            return jnp.abs(x[0])
+
+    for cost in (partial(lambda x, scale: scale * jnp.abs(x[0]), scale=1.0), Far()):
+        made = pg.compose(CONFIG, TASK._replace(cost=cost))
+        assert made.task.cost.of_state(X) == pytest.approx(0.3)
+
+
+MOVING = Plant()
+COUNTING: dict[str, Any] = dict(reset=lambda key: {"x": X, "t": 0}, observe=lambda state: state["x"])
+WRONG_PLANTS: list[tuple[dict[str, Any], str]] = [
+    (
+        dict(step=lambda x, u: jnp.round(x).astype(int)),
+        r"plant\.step returns a state of int32\[2\]; expected float32\[2\]",
+    ),
+    (
+        dict(step=lambda x, u: x[:1]),
+        r"plant\.step returns a state of float32\[1\]; expected float32\[2\], as plant\.reset",
+    ),
+    (
+        dict(reset=lambda key: jnp.array([1, 0])),
+        r"plant\.step returns a state of float32\[2\]; expected int32\[2\], as plant\.reset",
+    ),
+    (dict(step=lambda x, u: None), r"plant\.step returns a state of parts PyTreeDef\(None\); expected PyTreeDef\(\*\)"),
+    (dict(reset=lambda key: jnp.zeros(3)), r"what plant\.observe returns has shape \(3,\); expected \[D\] \(2,\)"),
+    (
+        COUNTING | dict(step=lambda state, u: {"x": X, "t": jnp.zeros(3)}),
+        r"plant\.step returns a state\['t'\] of float32\[3\]",
+    ),
+]
+
+
+@pytest.mark.parametrize(("parts", "message"), WRONG_PLANTS)
+def test_a_plant_whose_state_changes_its_form_is_named_in_one_line(parts: dict[str, Any], message: str) -> None:
+    experiment = pg.compose(CONFIG, TASK._replace(plant=MOVING._replace(**parts)))
+    with pytest.raises(ValueError, match=f"^{message}"):
+        jax.eval_shape(experiment.collect, jax.eval_shape(experiment.init, key()))
+
+
+def test_a_plant_may_count_in_numbers_of_python() -> None:
+    plant = MOVING._replace(**COUNTING, step=lambda state, u: {"x": state["x"], "t": state["t"] + 0.1})
+    experiment = pg.compose(CONFIG, TASK._replace(plant=plant))
+    assert jax.eval_shape(experiment.collect, jax.eval_shape(experiment.init, key())).x.shape == (H + 1, D)
+
+
+@pytest.mark.parametrize("size", [0, -5])
+def test_a_batch_of_no_rows_is_refused(size: int) -> None:
+    message = rf"^batch_size={size} is out of range; .* the nearest is 1$"
+    with pytest.raises(pg.ConfigError, match=message):
+        pg.minibatches(DYNAMICS, optax.adam(1e-3), batch_size=size)
+    how: dict[str, Any] = dict(prepare=DYNAMICS.prepare, loss=DYNAMICS.loss, optimizer=optax.adam(1e-3), steps=1)
+    with pytest.raises(pg.ConfigError, match=message):
+        pg.fit(key(), pg.TrainState((), ()), experience(), **how, batch_size=size)
+
+
+def test_a_saturation_that_is_none_is_refused() -> None:
+    with pytest.raises(pg.ConfigError, match=r"^squash=sin is not a choice; did you mean 'sine'\? choices: tanh, sine"):
+        pg.of_pair(lambda key: (), lambda params, features: features, TASK, squash="sin")
+
+
+def test_a_task_that_is_none_is_refused_with_all_of_them() -> None:
+    with pytest.raises(pg.ConfigError, match=r"^task=carpole is .*did you mean 'cartpole'\? choices: .*, gym, mjcf$"):
+        pg.build(pg.Config(task="carpole"))
 
 
 WRONG_KINDS: list[tuple[dict[str, Any], str]] = [

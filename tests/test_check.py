@@ -222,3 +222,9 @@ def test_names_that_do_not_agree_with_angles_are_noted(
     free = np.full(2, np.inf)
     facts = Facts(np.zeros(2), np.ones(2), angles, -free, free, np.zeros((0, 2)))
     assert check.turning(facts, names) == told
+
+
+def test_a_period_that_may_be_in_milliseconds_is_noted() -> None:
+    task = cart()._replace(horizon=60)
+    assert check.lasting(task._replace(dt=9.9)) == []
+    assert check.lasting(task._replace(dt=25.0)) == ["an episode of 60 periods of 25 s takes 1500 s; is dt in seconds?"]

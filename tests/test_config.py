@@ -99,7 +99,15 @@ IMPOSSIBLE = [
     (Search, dict(steps=10**20), "the nearest is 10000000"),
     (Period, dict(match=None), "search.period.match=null is not a whole number"),
     (MLP, dict(squash=None), "policy.squash=null is not a word"),
-    (Fit, dict(steps="10"), "fit.steps=10 is not a whole number"),
+    (Fit, dict(steps="10"), "fit.steps=10 is not a whole number as written, '10'; write fit.steps=10"),
+    (Fit, dict(steps=1e3), "fit.steps=1000 is not a whole number as written, 1000.0; write fit.steps=1000"),
+    (
+        BNN,
+        dict(hidden=[8.0]),
+        "model.hidden=[8] is not a list of whole numbers as written, [8.0]; write model.hidden=[8]",
+    ),
+    (Search, dict(grad_clip="None"), "is not a number or null as written, 'None'; write search.grad_clip=null"),
+    (Config, dict(x64="true"), "x64=true is not true or false as written, 'true'; write x64=true"),
 ]
 
 

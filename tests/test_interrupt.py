@@ -123,6 +123,11 @@ def test_what_close_raises_is_said_and_does_not_keep_the_command(capfd: pytest.C
     assert "pegasus: closing the environment failed, OSError: no answer" in capfd.readouterr().err
 
 
+def test_a_robot_that_was_not_closed_is_no_success(capfd: pytest.CaptureFixture[str]) -> None:
+    assert ended(begun(body="pass", closing="raise OSError('no answer')")) == (2, ["closing"])
+    assert capfd.readouterr().err.splitlines() == ["pegasus: closing the environment failed, OSError: no answer"]
+
+
 @pytest.mark.parametrize("code", [0, 2])
 def test_an_end_does_not_wait_for_the_threads_of_others(code: int) -> None:
     """A robot's driver, or a tracker, may have one that never ends."""

@@ -319,7 +319,7 @@ WRONG = [
         ["search.cost_estimator=mached is not a choice", "choices: gaussian, particles"],
     ),
     (["policy=rbf", "policy.num_centers=0"], ["policy.num_centers=0 is out of range", "the nearest is 1"]),
-    (["policy=linear", "policy.num_centers=9"], ["policy.num_centers is not a setting"]),
+    (["policy=linear", "policy.num_centers=9"], ["policy.num_centers is not a setting here, but of policy.kind=rbf; "]),
     (["algorithm=pilco", "search.grad_clip=1"], ["search.grad_clip is not a setting"]),
     (["model.dropout=lognormal"], ["model.dropout=lognormal is not a choice", "did you mean 'log_normal'?"]),
     (["policy.squash=tan"], ["did you mean 'tanh'?", "choices: tanh, sine"]),

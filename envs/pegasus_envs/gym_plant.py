@@ -237,7 +237,7 @@ def first(answer: Any) -> Any:
 
 
 def observed(x: Any, states: int, names: Sequence[str] = ()) -> np.ndarray:
-    """A copy of an observation [D], in single precision. Raises ValueError where it is not one, or not below LARGEST."""
+    """A copy of an observation [D], in single precision. Raises ValueError where it is none, or not below LARGEST."""
     try:
         x = np.array(x, np.float32)
     except (TypeError, ValueError) as error:

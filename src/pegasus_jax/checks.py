@@ -6,7 +6,7 @@ import math
 import numbers
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from functools import wraps
+from functools import partial, wraps
 from pathlib import PureWindowsPath
 from types import GenericAlias, UnionType
 from typing import Any, ParamSpec, TypeVar, get_args
@@ -169,8 +169,13 @@ def typed(section: str, node: Any) -> None:
 
 
 def expected(name: str, kind: Any, given: Any, default: Any) -> str:
-    """What a setting takes, in words, and an example: what is given in brackets where that is a list, or a default."""
+    """What a setting takes, in words, and an example: what is given in brackets where that is a list, or a default.
+
+    What was given, where only the way in which it is written is wrong: 20 for '20' and for 20.0, null for 'none'.
+    """
     places = ", which are places in the observation counted from 0" if name in PLACES else ""
+    with suppress(TypeError, ValueError):
+        return f"{called(kind)} as written, {given!r}; write {name}={shown(_as(kind, _meant(given)))}"
     example = default if default or kind not in EXAMPLES else EXAMPLES[kind]
     if isinstance(given, numbers.Real):
         with suppress(TypeError):
@@ -194,6 +199,16 @@ def _as(kind: Any, value: Any) -> Any:
     elif isinstance(value, kind):
         return value
     raise TypeError(f"{value!r} is not {called(kind)}")
+
+
+def _meant(value: Any) -> Any:
+    """The value that a text, or a whole number with a point, stands for. Raises ValueError for a text that is none."""
+    if isinstance(value, tuple | list):
+        return tuple(map(_meant, value))
+    if isinstance(value, str):
+        words = {"none": None, "null": None, "true": True, "false": False}
+        return words[value.lower()] if value.lower() in words else _meant(float(value))
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 PLACES = ("angles", "rates", "circles")  # settings that say which entries of an observation are something
@@ -235,7 +250,10 @@ def shown(value: Any) -> str:
     if isinstance(value, tuple | list):
         return "[" + ",".join(map(shown, value)) + "]"
     if callable(value):
-        return f"{value.__module__}:{value.__qualname__}"
+        try:
+            return f"{value.__module__}:{value.__qualname__}"
+        except AttributeError:  # no function, but what can be called like one
+            return shown(value.func if isinstance(value, partial) else type(value))
     words = f"{value:g}" if isinstance(value, float) else str(value)
     return words if words.isprintable() else repr(words)
 

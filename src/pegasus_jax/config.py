@@ -16,6 +16,9 @@ from pegasus_jax.config_models import BNN, GP, SSGP, Lagrangian, setting
 from pegasus_jax.config_plant import EVERY, Explore, Sensors
 from pegasus_jax.config_policies import MLP, RBF, Linear
 
+__all__ = ["BNN", "GP", "LBFGS", "MLP", "RBF", "SSGP", "Analytic", "Config", "Explore", "Fit", "Lagrangian", "Linear"]
+__all__ += ["Period", "Search", "Sensors"]
+
 MANEUVERS = ("knife_edge", "belly_up", "corkscrew", "depth_change")
 GYM = "gym"  # the task that `env=` and `cost=` describe
 MJCF = "mjcf"  # the task that `mjcf=`, `cost=`, `dt=` and `horizon=` describe

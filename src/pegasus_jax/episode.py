@@ -45,7 +45,8 @@ def run_with_trace(
     sensor_std = jnp.asarray(task.sensor_std, float)
 
     def measure(key: Key, state: object) -> Array:
-        x = plant.observe(state)
+        x = jnp.asarray(plant.observe(state), float)
+        check_shape("what plant.observe returns", x, (len(task.state_names),), "[D]")
         return x + sensor_std * jax.random.normal(key, x.shape)
 
     def step(carry: tuple, t_and_key: tuple[Array, Key]) -> tuple[tuple, tuple[Array, Array, Array, Array, Any]]:
@@ -55,7 +56,8 @@ def run_with_trace(
         u = act(act_key, t, see(m, x))
         check_shape("what policy.apply returns", u, (len(task.control_names),), "[U]")
         looked = look(state, u)
-        state = plant.step(state, u)
+        before, state = state, plant.step(state, u)
+        check_state(before, state)
         after = measure(sensor_key, state)
         m = advance(m, x, u)
         seen = recall.join(plant.observe(state), m)
@@ -73,6 +75,23 @@ def run_with_trace(
         return Trajectory(xs, us, costs, memory=m), looks
     length = jnp.where(jnp.any(over), jnp.argmax(over) + 1, task.horizon).astype(jnp.int32)
     return Trajectory(xs, us, jnp.where(times < length, costs, task.stop_cost), length, m), looks
+
+
+def check_state(before: Any, after: Any) -> None:
+    """Raises ValueError, in one line, unless a plant's state has the same parts, shapes and types after a step.
+
+    The type of a number that Python made, as 0 of `{"t": 0}`, is JAX's to choose.
+    """
+    parts, now = jax.tree.structure(before), jax.tree.structure(after)
+    if parts != now:
+        raise ValueError(f"plant.step returns a state of parts {now}; expected {parts}, as plant.reset returns it")
+    for (path, was), now in zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True):
+        was, now, where = jax.typeof(was), jax.typeof(now), jax.tree_util.keystr(path)
+        if was.shape != now.shape or not (was.dtype == now.dtype or was.weak_type):
+            raise ValueError(
+                f"plant.step returns a state{where} of {now.str_short()}; expected {was.str_short()}, as plant.reset"
+                " returns it"
+            )
 
 
 def drive(seed: int, act: Callable[[int, np.ndarray], Any], task: Task) -> Episode:

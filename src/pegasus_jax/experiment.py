@@ -61,11 +61,11 @@ class Experiment(NamedTuple):
     episode: Callable[[Key, Params, Array | bool], Trajectory]  # (key, policy parameters, random controls?)
     collect: Callable[[RunState], Trajectory]  # Alg. 1 line 3; with `episode`, the only one that touches the plant
     add_episode: Callable[[RunState, Trajectory], RunState]  # Alg. 1 line 4
-    fit: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 5
-    search: Callable[..., tuple[RunState, Any]]  # Alg. 1 line 6
+    fit: Callable[..., tuple[RunState, FitInfo]]  # Alg. 1 line 5
+    search: Callable[..., tuple[RunState, SearchInfo]]  # Alg. 1 line 6
     # (state, policy parameters before the search) -> (state with the policy that goes on, Successor)
     succeed: Callable[[RunState, Params], tuple[RunState, Successor]]
-    improve: Callable[[RunState], tuple[RunState, Any]]  # fit, search, succeed
+    improve: Callable[[RunState], tuple[RunState, tuple[FitInfo, SearchInfo]]]  # fit, search, succeed
     imagine: Callable[[RunState], tuple[Rollout, Array]]  # fresh scenarios -> (rollout, cost [H, K])
     calibrate: Callable[[RunState, Trajectory], Array]  # of the model, on an episode not yet added -> calibration
     # `episode` on the task's environment, which says how it ended and keeps the rows of one that failed; None: the

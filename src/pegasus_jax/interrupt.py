@@ -31,6 +31,7 @@ class _State:
 
     listening = False
     closing = False
+    unclosed = False
     held = False
     repeated = False
     asked: list[int] = []  # noqa: RUF012
@@ -105,6 +106,7 @@ def let_go(close: Callable[[], None]) -> None:
     try:
         close()
     except Exception as error:
+        _State.unclosed = True
         print(f"pegasus: closing the environment failed, {type(error).__name__}: {error}", file=sys.stderr)
     finally:
         _State.closing = False
@@ -121,7 +123,11 @@ def status() -> int:
 
 
 def end(code: int) -> None:
-    """End the process with this status: what still compiles is waited for by a success only, others' threads never."""
+    """End the process with this status, or with 2 for 0 where a robot was not closed: its motors may be on.
+
+    What still compiles is waited for by a success only, others' threads never.
+    """
+    code = code or 2 * _State.unclosed
     for thread in threading.enumerate() if code == 0 else ():
         if thread.name == WAITED:
             thread.join()

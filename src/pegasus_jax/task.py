@@ -7,7 +7,7 @@ import numpy as np
 from jax.core import Tracer
 
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.types import NO_MEMORY, Array, Cost, Hindsight, Memory
+from pegasus_jax.types import NO_MEMORY, Array, Hindsight, Memory
 
 
 class Signal(NamedTuple):
@@ -22,7 +22,7 @@ class Task(NamedTuple):
 
     name: str
     plant: Any  # reset(key) -> state; step(state, u [U]) -> state; observe(state) -> x [D]. None: others give episodes
-    cost: Cost
+    cost: Any  # a `Cost`, or what `compose` makes one of: a function of x [D] and, by their names, of `terms`
     angles: tuple[int, ...]  # the dimensions of x that are angles [rad]
     start_mean: Any  # [D]
     start_std: Any  # [D]
@@ -79,6 +79,8 @@ def checked(task: Task) -> Task:
             )
     if not isinstance(task.horizon, int | np.integer) or task.horizon < 1:
         raise ConfigError(f"the task's horizon={task.horizon!r} is not a whole number of control periods, at least 1")
+    if not isinstance(task.dt, Tracer) and not 0 < task.dt < np.inf:
+        raise ConfigError(f"the task's dt={task.dt:g} is no control period; expected a number of seconds above 0")
     if wrong := [angle for angle in task.angles if angle not in range(states)]:
         raise ConfigError(f"the task's angles={task.angles} has {wrong[0]}; its {states} states are 0 to {states - 1}")
     if not any(isinstance(limit, Tracer) for limit in (task.control_low, task.control_high)):

@@ -66,7 +66,7 @@ def compose(
     policy: Policy | None = None,
     fitter: ModelLearner | None = None,
     searcher: PolicyOptimizer | None = None,
-    cost: Cost | Callable[[Array], Array] | None = None,
+    cost: Cost | Callable[..., Array] | None = None,
     mesh: Mesh | None = None,
     logged: int = 0,
 ) -> Experiment:
@@ -156,7 +156,7 @@ def within(policy: Policy, task: Task) -> Policy:
     return policy._replace(apply=apply)
 
 
-def as_cost(cost: Cost | Callable[[Array], Array]) -> Cost:
+def as_cost(cost: Cost | Callable[..., Array]) -> Cost:
     """The cost itself, or that of a function of one state x [D]. Raises ConfigError for what is neither."""
     if not isinstance(cost, Cost) and not callable(cost):
         raise ConfigError(f"cost={cost!r} is no Cost; expected one, or a function of one state x [D]")

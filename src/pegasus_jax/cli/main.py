@@ -55,7 +55,7 @@ def main(
     stopped: str = "nothing was learned",
     always: Always = lambda: (),
 ) -> None:
-    """Run a command: 0 done, 2 a setting or a run's folder that cannot be, in one line, 130 after Ctrl-C.
+    """Run a command: 0 done, 2 what cannot be or a robot that did not close, in one line, 130 after Ctrl-C.
 
     `always` are words that come after those that were typed, if any were.
     Whatever ends it, a robot is let go first, and no thread that still compiles is waited for.

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from pegasus_jax.checks import check_range
 from pegasus_jax.learn.data import minibatch
 from pegasus_jax.learn.updates import is_finite, update_if
 from pegasus_jax.shapes import check_data
@@ -36,8 +37,9 @@ def fit(
 
     `optimizer` is any of optax, and `learner.optimizer` its state, `optimizer.init(params)`. A loss or a
     gradient that is not finite changes neither. An optimizer that searches along a line gets the loss of the same rows
-    and noise. Raises ValueError for data of other shapes than a `Dataset` has.
+    and noise. Raises ValueError for data of other shapes than a `Dataset` has, and for a batch of no rows.
     """
+    check_range("batch_size", batch_size, 1)
     check_data(data)
     context = prepare(data)
 
@@ -68,7 +70,11 @@ def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
 
 
 def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch_size: int) -> ModelLearner:
-    """The fitter that takes `optimizer`'s steps on minibatches; each fit goes on with the moments of the one before."""
+    """The fitter that takes `optimizer`'s steps on minibatches; each fit goes on with the moments of the one before.
+
+    Raises ConfigError for a `batch_size` [rows] below 1.
+    """
+    check_range("batch_size", batch_size, 1)
 
     def run(key: Key, learner: TrainState, data: Dataset, steps: int) -> tuple[TrainState, FitInfo]:
         return fit(

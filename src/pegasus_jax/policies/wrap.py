@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
+from pegasus_jax.checks import choice
 from pegasus_jax.math.angles import encode
 from pegasus_jax.memory import seen_angles
 from pegasus_jax.policies.squash import SQUASHES, to_limits
@@ -17,8 +18,9 @@ def of_pair(
     """u = apply(params, features [F]) [U], any real numbers, saturated to the task's limits by tanh or sine.
 
     The features are those of every other controller: what the policy sees, with its angles as sines and cosines
-    (`angles.encode`): the state, and what the task's memory shows.
+    (`angles.encode`): the state, and what the task's memory shows. Raises ConfigError for another saturation.
     """
+    choice("squash", squash, SQUASHES)
     low, high = jnp.asarray(task.control_low, float), jnp.asarray(task.control_high, float)
     saturate = to_limits(SQUASHES[squash], low, high)
     turning = seen_angles(task)

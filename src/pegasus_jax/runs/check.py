@@ -21,6 +21,7 @@ from pegasus_jax.task import Task
 from pegasus_jax.tasks import assumed, constrained, cost_check, guide, signals, user_code
 
 RESETS = 20  # of an environment that may be reset without need
+LONG = 600  # [s] of an episode from which on its period may be in other units
 EXACT = 1e-4  # of an entry's spread: what is left of it is rounding
 
 
@@ -31,7 +32,7 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     is looked at first: a mistake in it moves no robot.
     """
     guide.check(config, task)
-    rates = slow(task)
+    rates = [*slow(task), *lasting(task)]
     if config.cost is None and task.constraint is None:
         return rates
     low, high = tasks.observation_limits(config, task)
@@ -75,6 +76,13 @@ def slow(task: Task) -> list[str]:
         elif (periods := (high - low) / change) > task.horizon:
             notes.append(f"control_rate={rate:g} lets {way} in {periods:.0f} periods; an episode has {task.horizon}")
     return notes
+
+
+def lasting(task: Task) -> list[str]:
+    """The note on an episode that takes so long that its period may be in milliseconds: one line, or none."""
+    if (seconds := task.horizon * task.dt) < LONG:
+        return []
+    return [f"an episode of {task.horizon} periods of {task.dt:g} s takes {seconds:g} s; is dt in seconds?"]
 
 
 def unsaid(given: Config, known: Config, task: Task) -> list[str]:

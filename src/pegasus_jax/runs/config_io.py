@@ -61,7 +61,7 @@ def parse(words: Mapping[str, Any], options: Sequence[str] = ()) -> Config:
     for key in words:
         refuse(key)
         if key not in known:
-            raise ConfigError(f"{key} is not a setting; {_hint(key, [*known, *NAMED, *options])}")
+            raise ConfigError(f"{key} is not a setting{_of_others(key)}; {_hint(key, [*known, *NAMED, *options])}")
         check_used(config.task, {key: words[key]})
     changed = override(config, values(words))
     if "start_std" in words:
@@ -97,7 +97,7 @@ def override(config: Config, changes: dict[str, Any]) -> Config:
     for key in changes:
         refuse(key)
         if key not in known:
-            raise ConfigError(f"{key} is not a setting; {_hint(key, [*known])}")
+            raise ConfigError(f"{key} is not a setting{_of_others(key)}; {_hint(key, [*known])}")
     return _changed(config, changes, "")
 
 
@@ -155,6 +155,13 @@ def stored_config(stored: dict[str, Any]) -> Config:
     if wrong := sorted(set(stored) - set(leaves(config))):
         raise ConfigError(f"not the config of a run of this version: see {', '.join(wrong[:5])}")
     return override(config, stored)
+
+
+def _of_others(key: str) -> str:
+    """Of a setting that other kinds of its section have, which these are; "" of one that none has."""
+    section = key.partition(".")[0]
+    owners = [name for name, kind in KINDS.get(section, {}).items() if key in leaves(kind, f"{section}.")]
+    return f" here, but of {section}.kind={' or '.join(owners)}" if owners else ""
 
 
 def _hint(key: str, choices: Sequence[str]) -> str:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pegasus_jax import interrupt, memory
-from pegasus_jax.checks import ConfigError, did_you_mean
+from pegasus_jax.checks import ConfigError, choice, did_you_mean
 from pegasus_jax.config import GYM, MJCF, Config
 from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.math import circles
@@ -20,7 +20,7 @@ from pegasus_jax.tasks import circled, constrained, guide, priors, sensed, terms
 from pegasus_jax.tasks.own_plants import TASKS
 from pegasus_jax.tasks.signals import FILES, named, with_signals
 from pegasus_jax.tasks.starts import from_starts
-from pegasus_jax.tasks.terms import whole as whole
+from pegasus_jax.tasks.traceable import whole as whole
 from pegasus_jax.types import Cost
 
 if TYPE_CHECKING:
@@ -72,6 +72,7 @@ def of_config(config: Config) -> Task:
 def unsensed(config: Config) -> Task:
     """The task that a config names, as it is without the config's sensors."""
     own = {GYM: from_gym, MJCF: from_mjcf}
+    choice("task", config.task, (*TASKS, *own))
     task = own[config.task](config) if config.task in own else make(config.task, config.legs, config.env_args)
     if config.cost is not None and config.task not in own:
         task = task._replace(cost=Cost(user_code.load("cost", config.cost)))
