@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.cli.train import check as check_command
+from pegasus_jax.cli.train import understood
 from pegasus_jax.config import Config
 from pegasus_jax.runs import check
 from pegasus_jax.tasks.cost_check import Facts
@@ -228,3 +230,10 @@ def test_a_period_that_may_be_in_milliseconds_is_noted() -> None:
     task = cart()._replace(horizon=60)
     assert check.lasting(task._replace(dt=9.9)) == []
     assert check.lasting(task._replace(dt=25.0)) == ["an episode of 60 periods of 25 s takes 1500 s; is dt in seconds?"]
+
+
+@pytest.mark.parametrize(("word", "told"), [("seeds=0", "seeds=0 is out of range"), ("final=maybe", "final=maybe is")])
+def test_what_a_run_would_refuse_the_check_refuses_too(word: str, told: str) -> None:
+    for command in (check_command, understood):
+        with pytest.raises(ConfigError, match=told):
+            command(["task=cartpole", word])

@@ -60,14 +60,13 @@ def _configured(asked: Asked, options: dict[str, str]) -> Any:
 def check(words: Sequence[str]) -> None:
     from pegasus_jax.runs import config_io
 
-    options, rest = config_io.split(words, OPTIONS)
+    options, _ = config_io.split(words, OPTIONS)
     if "resume" in options:
         raise ConfigError(f"resume={options['resume']} was checked when it began; give the words of a new run")
-    config = config_io.parse(rest, options=OPTIONS)
-    trackers.asked(options.get("track"))
+    asked, _ = understood(words)
     from pegasus_jax.runs.check import report
 
-    print("\n".join(report(config)))
+    print("\n".join(report(asked.config)))
 
 
 def _join(options: dict[str, str]) -> None:
