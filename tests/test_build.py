@@ -77,7 +77,13 @@ def test_a_mechanism_needs_coordinates_and_their_rates():
 
 
 def test_the_rates_of_a_gym_are_named_and_checked():
-    words = {"task": "gym", "env": "InvertedPendulum-v5", "cost": "math:cos", "model": "lagrangian", "angles": "[1]"}
+    words = {
+        "task": "gym",
+        "env": "InvertedPendulum-v5",
+        "cost": "jax.numpy:sum",
+        "model": "lagrangian",
+        "angles": "[1]",
+    }
     compose(known := config_io.parse(words | {"rates": "[2,3]"}), tasks.of_config(known))
     for rates, expected in (
         ("[2,9]", "rates=9 is not an entry"),

@@ -132,7 +132,8 @@ def test_a_run_goes_on_from_where_its_rows_end(run: Path) -> None:
 def test_the_last_episode_counts_though_it_has_no_row(run: Path) -> None:
     """The policy after the last trial is the best as soon as its own episode says so."""
     assert restore.best(run) == 2
-    assert restore.chosen(run, "best", 2) == "best policy: trial 2 (cost 0.700 in 1 of the episodes)"
+    told = "best policy: trial 2 (cost 0.700, ran in 1 episode); that of trial 3 has not run yet: trial=last takes it"
+    assert restore.chosen(run, "best", 2) == told
     assert [restore.chosen(run, asked, 3) for asked in ("last", 3)] == [
         "newest policy: trial 3",
         "policy of trial 3, as asked",
@@ -142,7 +143,7 @@ def test_the_last_episode_counts_though_it_has_no_row(run: Path) -> None:
     good = cheap.trajectory._replace(cost=0.01 * cheap.trajectory.cost)
     store.save_episode(run, 4, good, task, policy=3, ended="horizon")
     assert restore.best(run) == 3
-    assert restore.chosen(run, "best", 3) == f"best policy: trial 3 (cost {good.cost.mean():.3f} in 1 of the episodes)"
+    assert restore.chosen(run, "best", 3) == f"best policy: trial 3 (cost {good.cost.mean():.3f}, ran in 1 episode)"
     store.save_episode(run, 4, good, task, policy=3, ended="error")
     assert restore.best(run) == 2
     # One that ended early pays for what it left out.
@@ -165,7 +166,7 @@ def test_every_command_takes_the_best_policy(
     monkeypatch.setattr(evaluation, "evaluate_run", lambda *given: told)
     commands.evaluate([str(run)])
     assert capsys.readouterr().out.splitlines() == [
-        "best policy: trial 2 (cost 0.700 in 1 of the episodes)",
+        "best policy: trial 2 (cost 0.700, ran in 1 episode); that of trial 3 has not run yet: trial=last takes it",
         "20 episodes: mean cost 0.333, success 95%",
     ]
     commands.evaluate([str(run), "json=true"])

@@ -59,7 +59,7 @@ def test_a_run_says_it_once_for_each_two_trials(monkeypatch: pytest.MonkeyPatch)
     said: list[str] = []
     shown = {"phase": lambda *told: None, "trial": lambda rows: said.append(f"trial {rows[0]['trial']}")}
     display = SimpleNamespace(line=said.append, **shown)
-    given = dict(writer=writers.nothing(1), config=Config(trials=4), display=display, logs=NONE)
+    given = dict(writer=writers.nothing(1), config=Config(trials=4), display=display, logs=NONE, cost_since=[1])
     experiment = SimpleNamespace(task=SimpleNamespace(environment=None))
     job = SimpleNamespace(program=SimpleNamespace(concurrent=True), experiment=experiment, **given)
     train.learn(cast(Any, job), cast(Any, None))
