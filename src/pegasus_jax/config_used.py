@@ -11,10 +11,8 @@ from pegasus_jax.config import TASKS, Config, Explore, uses
 
 def check_config(config: Config) -> None:
     """Raises ConfigError for a setting of a plant's own that a config changes, and its task does not use."""
-    usual, own = leaves(Config()), used_by()
-    check_used(
-        config.task, {name: value for name, value in leaves(config).items() if name in own and value != usual[name]}
-    )
+    usual = leaves(Config())
+    check_used(config.task, {name: value for name, value in leaves(config).items() if value != usual.get(name, value)})
 
 
 def check_used(task: str, given: Mapping[str, Any]) -> None:

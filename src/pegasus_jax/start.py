@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 from pegasus_jax.checks import SIZES, ConfigError, brief, check_range
 from pegasus_jax.config import Config, label
+from pegasus_jax.config_used import check_config, check_used
 from pegasus_jax.runs import trackers
 
 Mesh = Any  # a jax.sharding.Mesh; None: one device
@@ -96,12 +97,11 @@ def train(
 
 
 def _config_of(config: Config | str | None, given: dict[str, Any]) -> Config:
-    from pegasus_jax import config_used
     from pegasus_jax.runs import config_io
 
     if isinstance(config, Config):
-        config_used.check_config(config)
-        config_used.check_used(config.task, given)
+        check_config(config)
+        check_used(config.task, given)
         return config_io.override(config, config_io.values(config_io.without_random(given)))
     if config is not None and not isinstance(config, str):
         kind = type(config).__name__
@@ -128,7 +128,6 @@ def going_on(home: Path, changes: dict[str, Any]) -> Asked:
 
     A function, which from Python takes the place of one that nobody else can import, is the caller's word.
     """
-    from pegasus_jax import config_used
     from pegasus_jax.runs import config_io, store
 
     if wrong := sorted(key for key, value in changes.items() if not (_changeable(key) or callable(value))):
@@ -140,7 +139,7 @@ def going_on(home: Path, changes: dict[str, Any]) -> Asked:
     first = store.existing(next(iter(runs.values()), home))
     mjcf = changes.pop("mjcf", None)
     config = config_io.override(config_io.load(first / "config.yaml"), config_io.values(changes))
-    config_used.check_used(config.task, changes)
+    check_used(config.task, changes)
     _one_environment(config, len(runs))
     return Asked(config, home, runs or {config.seed: home}, first, mjcf)
 

@@ -2,10 +2,12 @@
 
 from collections.abc import Sequence
 
+import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax.logs.read import Logged
 from pegasus_jax.logs.table import names_of
+from pegasus_jax.math.angles import difference
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.memory import measured
 from pegasus_jax.task import Task
@@ -45,13 +47,16 @@ def far(logs: Sequence[Logged], task: Task) -> list[str]:
     Far is FAR standard deviations of those starts; an entry that never varies there says nothing.
     """
     begun = [one for one in logs if one.begins]
+    if not begun:
+        return []
     spread = np.hypot(np.asarray(task.start_std, float), np.asarray(task.sensor_std, float))
+    first = jnp.asarray([one.trajectory.x[0] for one in begun])
+    away = np.abs(difference(first, jnp.asarray(task.start_mean, float), task.angles))  # [N, D]
     notes = []
     for i in measured(task):
         mean = float(task.start_mean[i])
-        off = np.array([float(one.trajectory.x[0, i]) - mean for one in begun])
-        off = np.abs(np.arctan2(np.sin(off), np.cos(off))) if i in task.angles else np.abs(off)
-        if spread[i] > 0 and len(off) and off.max() > FAR * spread[i]:
+        off = away[:, i]
+        if spread[i] > 0 and off.max() > FAR * spread[i]:
             one, count = begun[int(off.argmax())], int(np.sum(off > FAR * spread[i]))
             notes.append(
                 f"{one.source}{f' and {count - 1} more' if count > 1 else ''}: {task.state_names[i]} begins at"

@@ -25,7 +25,8 @@ def factor(given: str, wanted: str) -> float | None:
     (over, *under), (own, *below) = given.split("/"), wanted.split("/")
     if not under or len(under) != len(below):
         return None
-    parts = [_scale(over, own), *(_scale(theirs, mine) for mine, theirs in zip(under, below, strict=True))]
+    # Below a stroke it is the other way round: more of a smaller unit.
+    parts = [_scale(over, own), *(_scale(other, one) for one, other in zip(under, below, strict=True))]
     return None if None in parts else math.prod(part for part in parts if part)
 
 

@@ -95,7 +95,7 @@ def _to_come(plan: Plan, lengths: Sequence[int]) -> int:
     driven, most = sum(lengths), plan.most
     missing = enough(len(plan.task.control_names), most) - rows_of(lengths, most)
     left = max(plan.periods - driven, most + max(missing, 0))
-    # As many as `most` have no row of their own; and where what is allowed cannot be enough, nothing moves in vain.
+    # As many as `most` have no row of their own; and where what is allowed cannot be enough, nothing moves.
     useless = left <= most or left > LONGER * plan.periods - driven
     return 0 if useless or sum(n <= most + 1 for n in lengths) >= EPISODES else min(plan.task.horizon, left)
 

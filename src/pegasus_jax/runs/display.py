@@ -336,7 +336,7 @@ def best_line(rows: Sequence[dict[str, Any]], trial: int) -> str:
     own = [other["episode_cost"] for other in rows if other.get("policy") == trial and (trial or not other["random"])]
     if row["mean_cost"] is not None:
         return f"best policy: trial {trial} (success {row['success_rate']:.0%}, cost {row['mean_cost']:.3f})"
-    known = f"cost {np.mean(own):.3f}, ran in {len(own)} episode{'s'[: len(own) > 1]}" if own else "not run yet"
+    known = f"cost {np.mean(own):.3f}, ran in {len(own)} episode{'s' * (len(own) > 1)}" if own else "not run yet"
     newest, ran = max(row.get("trial", 0) for row in rows), {row.get("policy") for row in rows}
     more = "" if newest in {trial, *ran} else f"; that of trial {newest} has not run yet: trial=last takes it"
     return f"best policy: trial {trial} ({known}){more}"
