@@ -23,6 +23,7 @@ from pegasus_jax.exports.drive import drives, overruns, timed
 from pegasus_jax.report import content
 from pegasus_jax.report.read import look
 from pegasus_jax.runs import config_io, store
+from pegasus_jax.runs.driven import locked
 
 ROBOT = """
 import os, signal, sys, time
@@ -237,6 +238,14 @@ def test_an_overrun_is_a_tenth_of_a_period() -> None:
 
 
 # What a user does wrong
+
+
+def test_one_at_a_time_drives_by_a_run(home: Path) -> None:
+    """Two would write the same log."""
+    with locked(home / "run"):
+        done = driven(home, "seconds=0.1")
+    assert (done.code, "reset" in done.asked) == (2, False)
+    assert done.err.splitlines()[-1] == "pegasus: another pegasus-run drives by run; begin when it has ended"
 
 
 def test_what_cannot_be_is_refused(home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ import pytest
 
 import pegasus_jax as pg
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.runs import checkpoint, config_io, store
+from pegasus_jax.runs import begin, checkpoint, config_io, store
 from pegasus_jax.runs.restore import restored
 
 TINY = "task=gym env=Pendulum-v1 cost=mymodule:cost horizon=8 trials=3 eval_episodes=1 explore.trials=0"
@@ -101,7 +101,21 @@ def test_killed_before_its_first_trial_it_needs_the_logs_no_more(place: Path, wh
     assert states[0] == states[1]
 
 
-@pytest.mark.parametrize("word", ["control_rate=100", "sensors.delay=1", "history=2"])
+@pytest.mark.slow
+def test_another_run_begins_with_what_was_learned_from_logs(whole: Path, tmp_path: Path) -> None:
+    """The logs say how much room the data of the first run have."""
+    begin.copy(config_io.parse({"init": str(whole)}), tmp_path)
+    found, copied = (restored(run)[2].data.x.shape for run in (whole, tmp_path / begin.FOLDER))
+    assert found == copied
+
+
+@pytest.mark.parametrize(
+    "word",
+    [
+        "sensors.delay=1",
+        *(pytest.param(word, marks=pytest.mark.campaign) for word in ("control_rate=100", "history=2")),
+    ],
+)
 def test_logs_begin_a_run_whose_controller_remembers(place: Path, tmp_path: Path, word: str) -> None:
     words = command("data=logs/*.csv", f"out={tmp_path / 'run'}", "trials=1", word)
     done = subprocess.run(words, cwd=place, capture_output=True, text=True)

@@ -13,7 +13,8 @@ import pytest
 
 from folders import a_run, episode, row
 from pegasus_jax.checks import ConfigError, RunError
-from pegasus_jax.runs import files, store
+from pegasus_jax.cli.runs import paths_and
+from pegasus_jax.runs import display, files, store
 from pegasus_jax.runs.store import best_trial
 
 
@@ -278,3 +279,18 @@ def other_cost(rows: list[dict[str, Any]], since: int) -> list[dict[str, Any]]:
 )
 def test_the_best_policy(rows: list[dict[str, Any]], last: dict[str, Any] | None, best: int) -> None:
     assert best_trial(rows, last) == best
+
+
+def test_logs_are_no_episode_of_the_policy_of_before() -> None:
+    """A run with init= and data= has a policy of trial 0, which did not drive what the logs hold."""
+    rows = ran((0, 0.0, "horizon"), (1, 0.5, "horizon"))
+    for one, best in ((rows[0] | {"random": False}, 0), (rows[0] | {"random": False, "logs": 2}, 1)):
+        assert best_trial([one, rows[1]], first=0) == best
+        assert display.best_line([one, rows[1]], 0).startswith(f"best policy: trial 0 ({'not' if best else 'cost'}")
+
+
+def test_a_folder_may_have_an_equals_sign(tmp_path: Path) -> None:
+    """`pegasus-train out=runs/x=1` makes one, and says what reads it."""
+    (tmp_path / "x=1").mkdir()
+    words = [str(tmp_path / "x=1"), "trial=2"]
+    assert paths_and(words, {"trial": "best"}) == ([tmp_path / "x=1"], {"trial": "2"})

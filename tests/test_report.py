@@ -23,12 +23,12 @@ from pegasus_jax.cli import report as command
 from pegasus_jax.cli import runs as commands
 from pegasus_jax.episode import Episode, verdict
 from pegasus_jax.math.window import window
-from pegasus_jax.report import build, chart
+from pegasus_jax.report import build, chart, compare
 from pegasus_jax.report.chart import Level, Line
 from pegasus_jax.report.findings import findings
 from pegasus_jax.report.page import page
 from pegasus_jax.report.read import Look, coverage, look, settings
-from pegasus_jax.runs import config_io, groups, store
+from pegasus_jax.runs import config_io, groups, restore, store
 from pegasus_jax.viz import run_plots
 
 STEPS, PARTICLES = 25, 30
@@ -308,6 +308,15 @@ def test_a_folder_of_runs_is_compared(sweep: Path, tmp_path: Path, capsys: pytes
     assert written == [*map(str, (tmp_path / "a.html", *(tmp_path / "csv" / n for n in ("curves.csv", "means.csv")))),
                        str(sweep / "learning.png")]  # fmt: skip
     assert all(Path(name).stat().st_size > 500 for name in written)
+
+
+def test_the_best_policy_is_that_of_every_other_command(tmp_path: Path) -> None:
+    """Of the newest policy there is an episode, and no trial, after final=true."""
+    run = a_run(tmp_path / "run", trials=3)
+    task = store.task_of(run)
+    assert compare.best_of(groups.readable([run])[0][0]) == restore.best(run) == 2
+    store.save_episode(run, 4, episode(task, 4), task, policy=3, ended="horizon")
+    assert compare.best_of(groups.readable([run])[0][0]) == restore.best(run) == 3
 
 
 def test_a_run_that_cannot_be_read_is_left_out_and_named(sweep: Path, tmp_path: Path) -> None:

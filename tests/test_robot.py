@@ -138,9 +138,10 @@ def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None
     cut = store.load_episode(tmp_path / "run", 2)
     assert cut is not None
     assert (cut.ended, cut.trajectory.x.shape, cut.trajectory.u.shape) == ("error", (3, 2), (2, 1))
-    code, _, err = call("train", "resume=run", "final=true", cwd=tmp_path)
+    code, out, err = call("train", "resume=run", "final=true", cwd=tmp_path)
     # The episode that was cut short is learned from; the last policy's own is the only one that moves the robot.
     assert (code, asked(tmp_path)) == (0, ["reset", *["step"] * 5, "close"]), err
+    assert re.search(r"^best policy: trial 2 \(cost .*, ran in 1 episode\)$", out, re.MULTILINE), out
     assert [(row["steps"], row["ended"], row["policy"]) for row in store.trials(tmp_path / "run")] == [
         (5, "horizon", 0),
         (2, "error", 1),

@@ -72,6 +72,16 @@ def test_python_leaves_what_the_command_leaves(
         pg.train(resume=other, settings={"model.hidden": [5]})
 
 
+def test_a_folder_that_is_taken_is_refused_before_a_robot_moves(tmp_path: Path, monkeypatch) -> None:
+    def checked(*_: Any) -> None:
+        raise AssertionError("the robot was reset")
+
+    monkeypatch.setattr(start, "_checked", checked)
+    (tmp_path / "config.yaml").touch()
+    with pytest.raises(pg.ConfigError, match=r"holds a run already; resume="):
+        pg.train("cartpole", out=tmp_path)
+
+
 @pytest.mark.slow
 def test_a_cost_is_a_function_of_an_observation(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     """Cosine and sine, though the policy has their angle. The run is read without it, and goes on with one alone."""

@@ -167,11 +167,15 @@ def start(asked: Asked, command: str, configure: Callable[[], Mesh]) -> None:
 
     if is_main_process():
         print(display.devices(), flush=True)
-    config, logs = _checked(asked, mesh)
-    if asked.resumed is None and is_main_process():
+    new = asked.resumed is None and is_main_process()
+    if new:  # before a robot moves
         if store.seeds_of(asked.home):
             free = store.free(asked.home)
             raise ConfigError(f"out={asked.home} holds runs already; resume={asked.home} goes on, out={free} is free")
+        for run in asked.runs.values():
+            store.unused(run)
+    config, logs = _checked(asked, mesh)
+    if new:
         for run in asked.runs.values():
             store.create(run)
     told: dict[str, Any] = dict(command=command, final=asked.final, mesh=mesh, logs=logs)
@@ -219,7 +223,7 @@ def _summed_up(asked: Asked) -> None:
     from pegasus_jax.runs import display, restore, store
 
     for seed, run in asked.runs.items():
-        told = display.best_line(store.trials(run), restore.best(run))
+        told = restore.chosen(run, restore.BEST, restore.best(run))
         for line in filter(None, (display.limits_line(store.trials(run)), told)):
             print(f"seed {seed}: {line}" if len(asked.runs) > 1 else line)
     home = asked.home

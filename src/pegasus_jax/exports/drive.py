@@ -79,11 +79,12 @@ def drives(
         control = runpy.run_path(str(export(run, int(state.trial), out=Path(folder) / "policy.py")))["Controller"]()
     gc.freeze()  # nothing that is there is looked at by the garbage collector while the robot moves
     try:
-        for number in range(episodes):
-            control.reset()
-            with interrupt.held():  # a log is written before a signal is heard again
-                done = _driven(run, task, control, int(state.trial), seed + number, limit)
-            yield done
+        with driven.locked(run):  # two would write the same log
+            for number in range(episodes):
+                control.reset()
+                with interrupt.held():  # a log is written before a signal is heard again
+                    done = _driven(run, task, control, int(state.trial), seed + number, limit)
+                yield done
     finally:
         tasks.close(task)
         gc.unfreeze()

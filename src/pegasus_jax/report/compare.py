@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from pegasus_jax.checks import shown
+from pegasus_jax.checks import RunError, shown
 from pegasus_jax.report.chart import sparkline
 from pegasus_jax.report.compared_curves import COLORS, Compared, areas, curves, files
 from pegasus_jax.report.findings import Finding, said
 from pegasus_jax.report.page import Section, downloads, facts, number, table
-from pegasus_jax.runs import config_io, groups, store
+from pegasus_jax.runs import config_io, groups, restore
 from pegasus_jax.runs.groups import Group, Run, measured, middle, plant_seconds
 from pegasus_jax.runs.study import first_solved
 
@@ -142,7 +142,7 @@ def _runs(found: Compared) -> str:
 
 
 def _of_run(found: Compared, group: Group, run: Run) -> list[str]:
-    last, best = run.rows[-1], _best(run)
+    last, best = run.rows[-1], best_of(run)
     return [
         f"<code>{escape(str(run.path))}</code>",
         escape(group.label),
@@ -151,15 +151,15 @@ def _of_run(found: Compared, group: Group, run: Run) -> list[str]:
         sparkline(run.curve(found.kind.cost)),
         number(last.get(found.kind.cost)),
         number(last.get(found.kind.success), ".0%"),
-        str(best or "–"),
+        "–" if best is None else str(best),
         number(run.rows[best - 1].get(found.kind.cost) if best else None),
     ]
 
 
-def _best(run: Run) -> int | None:
+def best_of(run: Run) -> int | None:
     try:
-        return store.best_trial(run.rows)
-    except (KeyError, TypeError):  # of a version that wrote less
+        return restore.best(run.path)
+    except RunError:  # of a version that wrote less
         return None
 
 

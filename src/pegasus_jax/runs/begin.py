@@ -15,7 +15,7 @@ from pegasus_jax.checks import ConfigError, RunError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.memory import seen_names
-from pegasus_jax.runs import checkpoint, config_io, restore, store
+from pegasus_jax.runs import checkpoint, config_io, logged, restore, store
 from pegasus_jax.task import Task
 from pegasus_jax.types import RunState, TrainState
 
@@ -107,7 +107,9 @@ def copy(config: Config, run: Path) -> None:
     (run / FOLDER / "checkpoints").mkdir(parents=True)
     for name in ("config.yaml", "run.json", f"checkpoints/{trial:04d}.json"):
         shutil.copyfile(old / name, run / FOLDER / name)
-    shutil.copytree(old / "checkpoints" / f"{trial:04d}", run / FOLDER / "checkpoints" / f"{trial:04d}")
+    for folder in (f"checkpoints/{trial:04d}", logged.FOLDER):  # logs say how much room its data have
+        if (old / folder).is_dir():
+            shutil.copytree(old / folder, run / FOLDER / folder)
 
 
 def begun(states: RunState, config: Config, run: Path | None = None) -> RunState:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+from filelock import FileLock, Timeout
 
 from pegasus_jax.checks import RunError
 from pegasus_jax.runs import store
@@ -26,6 +29,21 @@ class Driven(NamedTuple):
     episode: Episode
     task: Task  # the run's, with the horizon of this episode
     overruns: int  # controls that were sent late
+
+
+@contextmanager
+def locked(run: Path) -> Iterator[None]:
+    """With the right to drive by a run. Raises RunError when another process has it."""
+    (run / FOLDER).mkdir(exist_ok=True)
+    guard = FileLock(run / FOLDER / ".lock")
+    try:
+        guard.acquire(timeout=0)
+    except Timeout:
+        raise RunError(f"another pegasus-run drives by {run}; begin when it has ended") from None
+    try:
+        yield
+    finally:
+        guard.release()
 
 
 def path_of(run: Path, number: int) -> Path:

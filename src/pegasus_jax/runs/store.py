@@ -60,7 +60,7 @@ COLUMNS = ("plant_seconds", "episode_cost", "mean_cost", "success_rate", "object
 
 def create(path: Path) -> Path:
     """A new run's folder. Raises ConfigError when it cannot be made or holds a run already."""
-    _unused(path)
+    unused(path)
     try:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
@@ -70,7 +70,7 @@ def create(path: Path) -> Path:
     return path
 
 
-def _unused(path: Path) -> None:
+def unused(path: Path) -> None:
     """Raises ConfigError for a folder that holds a run, or what is left of one."""
     if (path / "config.yaml").exists():
         raise ConfigError(f"out={path} holds a run already; resume={path} goes on with it, out={free(path)} is free")
@@ -128,7 +128,7 @@ def lock(path: Path, *, new: bool = False) -> FileLock:
     except Timeout:
         raise RunError(f"{path} is being written by another process; stop it, or choose another out=") from None
     try:
-        _unused(path) if new else existing(path)
+        unused(path) if new else existing(path)
     except BaseException:
         guard.release()
         raise
@@ -331,13 +331,18 @@ def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None =
         return max(rows, key=lambda row: (row["success_rate"], -row["mean_cost"], row["trial"]))["trial"]
     own: dict[int, list[tuple[float, ...]]] = {}  # of each policy, (failed, broke the constraint, cost) of its episodes
     for row in [*rows, *([last_episode] if last_episode else [])]:
-        learned = row["policy"] or (first == 0 and not row["random"])
+        learned = row["policy"] or (first == 0 and ran_first(row))
         if learned and row["episode_cost"] is not None and row["ended"] not in CUT:
             broke = float(row.get("constraint_broken", False))
             own.setdefault(row["policy"], []).append((1.0 - row["episode_success"], broke, row["episode_cost"]))
     if not own:
         return rows[-1]["trial"]
     return min(own, key=lambda policy: (*np.mean(own[policy], 0), -policy))
+
+
+def ran_first(row: dict[str, Any]) -> bool:
+    """Whether a row's episode was of the policy that there was before the first trial: logs are of none."""
+    return row["policy"] == 0 and not row["random"] and "logs" not in row
 
 
 def cost_since(row: dict[str, Any]) -> int:
