@@ -1,15 +1,17 @@
-"""Logs beside what the environment says of itself: units of headers, times of other names, and where episodes start."""
+"""Logs beside what the environment says of itself: units, names, times, and where episodes start; late controls."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import pegasus_jax as pg
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config
 from pegasus_jax.logs.read import read
-from pegasus_jax.runs import config_io
+from pegasus_jax.runs import config_io, store
 from pegasus_jax.runs.logged import read_config
+from pegasus_jax.types import Trajectory
 from probes import cart, dial
 
 CART = cart()._replace(state_names=("x [m]", "v [m/s]"), control_names=("u [N]",))
@@ -153,3 +155,106 @@ def test_logs_that_begin_where_no_episode_does_are_noted(tmp_path):
     assert f"{file}: x [m] begins at 2.2, and episodes at 1 give or take 0.1: another column" in noted(file)
     twice = np.vstack([long, long])
     assert "a.csv and 1 more: x [m] begins" in noted(written(tmp_path / "a.csv", "t,x,v,u", twice))
+
+
+def test_a_piece_shorter_than_a_period_is_left_out_with_a_note(tmp_path):
+    rows = np.column_stack([0.01 * np.arange(30), np.linspace(1, 1.2, 30), np.zeros((30, 2))])
+    rows[4, 1] = np.nan
+    found, notes = read([written(tmp_path / "a.csv", "t,x,v,u", rows)], CART._replace(dt=0.05))
+    assert [len(one.trajectory.u) for one in found] == [4]
+    assert any(note.endswith("a.csv: a piece is shorter than a period; left out") for note in notes)
+    with pytest.raises(ConfigError, match=r"no episode: no rows follow each other for a period, 0\.3 s"):
+        read([written(tmp_path / "a.csv", "t,x,v,u", rows)], CART)
+
+
+@pytest.mark.parametrize("control", ["sent", "before"])
+def test_a_late_control_does_not_move_those_after_it_by_a_period(control, tmp_path):
+    sent = np.random.default_rng(0).uniform(-2, 2, 61)
+    rows = np.column_stack([0.05 * np.arange(61), np.linspace(1, 1.2, 61), np.zeros(61), sent])
+    rows[4:, 0] += 0.008
+    rows[:, 3] = np.roll(sent, 1) if control == "before" else sent
+    task = CART._replace(dt=0.05, horizon=60)
+    (one,), notes = read([written(tmp_path / "a.csv", "t,x,v,u", rows)], task, control=control)
+    np.testing.assert_allclose(one.trajectory.u[:, 0], sent[:60], atol=1e-6)
+    assert "change within" not in " ".join(notes)
+
+
+@pytest.mark.parametrize("rate", [0.25, 0.5, 2, 3, 10])
+def test_controls_held_for_a_period_are_found_at_any_rate(rate, tmp_path):
+    """Rows that many a period; where they are rarer, each control acts until the next row."""
+    t = np.round(np.arange(int(8 * rate) + 1) / rate, 6)
+    rows = np.column_stack([0.3 * t, t, 0 * t, np.floor(t) / 10])
+    (one,), _ = read([written(tmp_path / "a.csv", "t,x,v,u", rows)], CART)
+    step = max(1, round(1 / rate))
+    np.testing.assert_allclose(one.trajectory.u[:, 0], np.arange(8) // step * step / 10, atol=1e-6)
+
+
+def test_episodes_are_read_by_the_names_that_they_have(tmp_path):
+    """Also of a run whose state had more than is observed here; without a name of here they are read in order."""
+    file, states, controls = str(tmp_path / "a.npz"), ROWS[:, [1, 0]], ROWS[:-1, 2:]
+    np.savez(file, x=states, u=controls, dt=0.3, state_names=["v [m/s]", "X"], control_names=["u [N]"])
+    np.testing.assert_allclose(first(file, CART)[0], ROWS[:-1], atol=1e-6)
+    more = np.column_stack([np.zeros(5), states])
+    np.savez(file, x=more, u=controls, dt=0.3, state_names=["w", "v", "x"], control_names=["u"])
+    np.testing.assert_allclose(first(file, CART)[0], ROWS[:-1], atol=1e-6)
+    np.savez(file, x=ROWS[:, :2], u=controls, dt=0.3, state_names=["a", "b"], control_names=["c"])
+    np.testing.assert_allclose(first(file, CART)[0], ROWS[:-1], atol=1e-6)
+    np.savez(file, x=states, u=controls, dt=0.3, state_names=["v [km/h]", "x"], control_names=["u"])
+    with pytest.raises(ConfigError, match=r"the column v \[km/h\] is in km/h"):
+        read([file], CART)
+
+
+def test_episodes_with_computed_rates_are_read_by_name(tmp_path):
+    words = {"task": "cartpole", "sensors.measured": "[0,3]", "sensors.velocity": "difference"}
+    task = pg.build(config_io.parse(words)).task
+    x, u = np.random.default_rng(0).uniform(-0.5, 0.5, (6, len(task.state_names))), np.ones((5, 1))
+    ran = Trajectory(x, u, np.zeros(5))  # type: ignore[arg-type]
+    np.savez(tmp_path / "a.npz", **store.arrays_of("cartpole", 1, ran, task, policy=0, ended="horizon"))
+    (one,), _ = read([str(tmp_path / "a.npz")], task)
+    seen = [i for i in range(len(task.state_names)) if i not in task.rates]
+    np.testing.assert_allclose(one.trajectory.x[:, seen], x[:, seen], atol=1e-6)
+
+
+def test_observed_cosines_and_sines_are_read_by_name(tmp_path):
+    task = DIAL._replace(state_names=("w", "atan2(s, c)"), circles=((1, 2),), angles=(1,), cost=CART.cost)
+    x = np.array([[0.1, 1], [0.2, 2], [0.3, 3], [0.4, 4]])
+    seen = np.column_stack([np.cos(x[:, 0]), np.sin(x[:, 0]), x[:, 1]])
+    file, names = str(tmp_path / "a.npz"), ["atan2(s, c)", "w"]
+    np.savez(file, x=x, u=np.zeros((3, 1)), dt=1.0, state_names=names, circles=((0, 1),), observation=seen)
+    np.testing.assert_allclose(first(file, task)[0][:, :2], x[:-1, ::-1], atol=1e-6)
+
+
+@pytest.mark.parametrize(("text", "line"), [('"v\n[m/s]",x,u\n0,1,0\n', 1), ('x,v,u\n1,0,0\n1,"0,0\n1,0,0\n', 3)])
+def test_a_quote_that_goes_on_is_one_line(text, line, tmp_path):
+    (tmp_path / "a.csv").write_text(text)
+    with pytest.raises(ConfigError, match=rf"a.csv line {line}: a quote is not closed on its line") as refused:
+        read([str(tmp_path / "a.csv")], CART)
+    assert len(str(refused.value).splitlines()) == 1
+    (tmp_path / "a.csv").write_text('"v","x","u"\n0,"1",0\n0,1,0\n')
+    np.testing.assert_allclose(first(str(tmp_path / "a.csv"), CART)[0], [[1, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("head", "swapped"),
+    [
+        ("# hand-driven\n# v [m/s],x,u\n", True),
+        ("# v,x,u\n# by hand\n", False),  # only the last one
+        ("# by hand,,\n", False),  # as spreadsheets fill up a remark
+        ("0,1,2\n", False),
+    ],
+)
+def test_headers_as_numpy_and_pandas_write_them(head, swapped, tmp_path):
+    rows = ROWS[:, [1, 0, 2]] if swapped else ROWS
+    (tmp_path / "a.csv").write_text(head + "".join(f"{a:g},{b:g},{c:g}\n" for a, b, c in rows))
+    found, notes = first(str(tmp_path / "a.csv"), CART)
+    np.testing.assert_allclose(found, ROWS[:-1], atol=1e-6)
+    assert ("by their order" in " ".join(notes)) != swapped
+
+
+def test_a_file_is_read_once_whatever_the_letters_of_its_suffix(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "UP.CSV", "t,x,v,u", TIMED)
+    np.savez(tmp_path / "b", x=ROWS[:, :2], u=ROWS[:, 2:])
+    (tmp_path / "b.npz").rename(tmp_path / "b.NPZ")
+    found, _ = read(["UP.CSV", "*", str(tmp_path / "*.CSV")], CART)
+    assert [one.source for one in found] == ["UP.CSV", "b.NPZ"]

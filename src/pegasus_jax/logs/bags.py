@@ -30,7 +30,7 @@ def of_bag(path: Path, names: Names, columns: Sequence[str]) -> Table:
         raise ConfigError(f"data={path} needs rosbags: pip install 'pegasus-jax[logs]'") from error
     said = mapped(columns, names)
     try:
-        with AnyReader([_whole(path)], default_typestore=get_typestore(Stores.LATEST)) as bag:
+        with AnyReader([whole(path)], default_typestore=get_typestore(Stores.LATEST)) as bag:
             if not said:
                 topics = ", ".join(sorted(f"{c.topic} ({c.msgtype})" for c in bag.connections))
                 raise ConfigError(f"{path} needs {SETTING}=[/topic.field,...]; its topics are {topics}")
@@ -52,9 +52,9 @@ def of_bag(path: Path, names: Names, columns: Sequence[str]) -> Table:
     return Table(str(path), tuple(table), np.column_stack([*table.values()]), np.arange(len(grid)), "message")
 
 
-def _whole(path: Path) -> Path:
+def whole(path: Path) -> Path:
     """What is to be opened: of a bag that is a folder with its metadata, the folder."""
-    return path.parent if path.suffix == ".db3" and (path.parent / "metadata.yaml").exists() else path
+    return path.parent if path.suffix.lower() == ".db3" and (path.parent / "metadata.yaml").exists() else path
 
 
 def _series(path: Path, bag: Any, column: str) -> Series:

@@ -8,7 +8,7 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError, did_you_mean, shown
 from pegasus_jax.logs import times, units
-from pegasus_jax.logs.table import EPISODE, TIMES, Names, Table, plain
+from pegasus_jax.logs.table import EPISODE, TIMES, Names, Table, loose, plain
 
 SETTING = "data_columns"
 SHOWN = 8  # names of columns in a note
@@ -168,15 +168,11 @@ def matched(columns: Sequence[str], names: Sequence[str]) -> dict[str, str]:
     alike: dict[str, list[str]] = {}
     for column in columns:
         if column not in found.values():
-            alike.setdefault(_loose(plain(column)), []).append(column)
+            alike.setdefault(loose(column), []).append(column)
     for name in names:
-        if name not in found and len(alike.get(_loose(name), ())) == 1:
-            found[name] = alike[_loose(name)].pop()
+        if name not in found and len(alike.get(loose(name), ())) == 1:
+            found[name] = alike[loose(name)].pop()
     return found
-
-
-def _loose(name: str) -> str:
-    return name.casefold().replace("_", " ")
 
 
 def numbers(table: Table, column: Column) -> np.ndarray:

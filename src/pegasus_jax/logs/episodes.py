@@ -125,25 +125,28 @@ def _within_limits(table: Table, sent: np.ndarray, where: Layout, task: Task) ->
     np.clip(sent, low, high, out=sent)
 
 
-def periods(one: Segment, task: Task, note: Note) -> Segment:
-    """The segment at the task's control period.
+def periods(one: Segment, task: Task, note: Note) -> Segment | None:
+    """The segment at the task's control period; None where it is shorter than one.
 
     As it is where its rows come a period apart. Else states are interpolated linearly, angles the shorter way, and
-    controls are held.
+    controls are those held at the middle of each period: one that is sent late still acts for most of its own.
     """
     steps = np.diff(one.t)
     if np.abs(steps / task.dt - 1).max() <= JITTER:
         return one
     slack = 1e-3 * task.dt
     count = int((one.t[-1] - one.t[0] + slack) / task.dt)
+    if count == 0:
+        note("a piece is shorter than a period; left out")
+        return None
     grid = one.t[0] + task.dt * np.arange(count + 1)
     turning = [i in task.angles for i in measured(task)]
     x = np.column_stack([interpolated(grid, one.t, *pair) for pair in zip(one.x.T, turning, strict=True)])
-    held = np.searchsorted(one.t, grid[:-1] + slack, side="right") - 1
+    held = np.searchsorted(one.t, grid[:-1] + task.dt / 2, side="right") - 1
     within = np.minimum((one.t[:-1] - one.t[0] + slack) // task.dt, count - 1).astype(int)  # the period of each row
     note(f"a row every {np.median(steps):.3g} s or so: resampled to dt={task.dt:g}")
     if np.any(one.u != one.u[held][within]):
-        note(f"controls change within periods of dt={task.dt:g}; those at their beginning are taken")
+        note(f"controls change within periods of dt={task.dt:g}; those at their middle are taken")
     return Segment(grid, x, one.u[held], one.begins)
 
 

@@ -16,8 +16,9 @@ from pegasus_jax.checks import ConfigError, choice
 from pegasus_jax.config import DATA_CONTROLS
 from pegasus_jax.logs import bags, minari_sets
 from pegasus_jax.logs.columns import layout
+from pegasus_jax.logs.csv_files import of_csv
 from pegasus_jax.logs.episodes import Segment, periods, segments, with_rates
-from pegasus_jax.logs.table import Names, Table, names_of, of_csv, of_npz
+from pegasus_jax.logs.table import Names, Table, names_of, of_npz
 from pegasus_jax.task import Task
 from pegasus_jax.types import Array, Trajectory
 
@@ -66,13 +67,15 @@ def read(
         where, decided = layout(table, names, columns)
         if decided:
             note(decided)
-        own = [periods(one, task, note) for one in segments(table, where, task, control, note)]
-        if not own:
+        pieces = list(segments(table, where, task, control, note))
+        if not pieces:
             note("no two rows follow each other; left out")
         used = tuple(map(str, (*where.observation, *where.control)))
-        found += [(one, table.source, used) for one in own]
+        found += [(one, table.source, used) for piece in pieces if (one := periods(piece, task, note)) is not None]
     if not found:
-        raise ConfigError(f"data={','.join(files)} has no episode: no two rows follow each other")
+        raise ConfigError(
+            f"data={','.join(files)} has no episode: no rows follow each other for a period, {task.dt:g} s"
+        )
     told = [
         f"{own[0]}{f' and {len({*own}) - 1} more' if len({*own}) > 1 else ''}: {text}" for text, own in notes.items()
     ]
@@ -81,24 +84,28 @@ def read(
 
 def tables(files: Sequence[str], names: Names, columns: Sequence[str]) -> list[Table]:
     """The tables of files, patterns and data sets. Raises ConfigError for what is not there, or of no known kind."""
-    found = []
+    found: dict[str, Table] = {}  # of a file that two patterns name there is one
     for name in files:
         if name.startswith(minari_sets.PREFIX):
-            found.append(minari_sets.of_set(name.removeprefix(minari_sets.PREFIX), names))
+            found[name] = minari_sets.of_set(name.removeprefix(minari_sets.PREFIX), names)
             continue
         paths = [Path(path) for path in sorted(glob.glob(name, recursive=True))]
         if not paths:
             raise ConfigError(f"data={name}: there is no such file in {Path.cwd()}")
-        found += [_table(path, names, columns) for path in paths]
-    return found
+        for path in paths:
+            key = str(bags.whole(path).resolve())
+            if key not in found:
+                found[key] = _table(path, names, columns)
+    return [*found.values()]
 
 
 def _table(path: Path, names: Names, columns: Sequence[str]) -> Table:
-    if path.suffix in bags.SUFFIXES or path.is_dir():
+    suffix = path.suffix.lower()
+    if suffix in bags.SUFFIXES or path.is_dir():
         return bags.of_bag(path, names, columns)
-    if path.suffix == ".npz":
+    if suffix == ".npz":
         return of_npz(path, names)
-    if path.suffix in (".csv", ".txt", ".tsv"):
+    if suffix in (".csv", ".txt", ".tsv"):
         return of_csv(path)
     raise ConfigError(f"data={path} is no log that we read; expected .csv, .npz, {', '.join(bags.SUFFIXES)}")
 

@@ -1,8 +1,7 @@
-"""A log as it was read: a table of numbers. And the files that need no library of their own, CSV and NPZ."""
+"""A log as it was read: a table of numbers. And files of NumPy arrays as tables."""
 
-import csv
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -50,19 +49,24 @@ class Names(NamedTuple):
 def names_of(task: Task) -> Names:
     """The names of what a controller of the task is given, cosines and sines where the state has their angle."""
     given = memory.measured(task)
-    size, names = len(given) + len(task.circles), [plain(name) for name in task.state_names]
+    seen = tuple(map(plain, _observed([task.state_names[i] for i in given], task.circles)))
+    size = len(seen)
     place = dict(zip(circles.entries(size, task.circles), given, strict=True))
-    observed = {entry: names[place[entry]] for entry in place}
-    for pair in task.circles:  # of atan2(sine, cosine)
-        sine, _, cosine = observed[min(pair)].removeprefix("atan2(").removesuffix(")").partition(", ")
-        observed |= dict(zip(pair, (cosine, sine), strict=True))
     paired = {entry for pair in task.circles for entry in pair}
     turning = tuple(i not in paired and place[i] in task.angles for i in range(size))
     units = {plain(name): unit for name in (*task.state_names, *task.control_names) if (unit := said(name))}
-    angles = {observed[i]: "rad" for i in range(size) if turning[i]}
-    return Names(
-        tuple(observed[i] for i in range(size)), tuple(map(plain, task.control_names)), turning, angles | units
-    )
+    angles = {name: "rad" for name, turns in zip(seen, turning, strict=True) if turns}
+    return Names(seen, tuple(map(plain, task.control_names)), turning, angles | units)
+
+
+def _observed(states: Sequence[str], pairs: circles.Circles) -> list[str]:
+    """Names [O] of an observation, of those of its state [D]: of atan2(sine, cosine) the cosine and the sine."""
+    size = len(states) + len(pairs)
+    found = dict(zip(circles.entries(size, pairs), states, strict=True))
+    for pair in pairs:
+        sine, _, cosine = found[min(pair)].removeprefix("atan2(").removesuffix(")").partition(", ")
+        found |= dict(zip(pair, (cosine, sine), strict=True))
+    return [found[i] for i in range(size)]
 
 
 def plain(name: str) -> str:
@@ -70,45 +74,16 @@ def plain(name: str) -> str:
     return name.partition(" [")[0]
 
 
-def of_csv(path: Path) -> Table:
-    """The table of a text file, cells apart by commas, semicolons or tabs; a first line that is no numbers is a header.
-
-    Empty lines, and those that begin with #, are left out. Raises ConfigError, with the line, for a row of another
-    length.
-    """
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, ValueError) as error:
-        raise ConfigError(f"{path} cannot be read: {reason(error)}") from error
-    kept = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
-    if not kept:
-        raise ConfigError(f"{path} is empty; expected a header and rows of numbers")
-    comma = next((mark for mark in ",;\t" if mark in kept[0][1]), ",")
-    cells = [[cell.strip() for cell in row] for row in csv.reader((line for _, line in kept), delimiter=comma)]
-    header = any(_number(cell) is None for cell in cells[0])
-    names = tuple(cells[0]) if header else tuple(map(str, range(len(cells[0]))))
-    body, lines = cells[header:], np.array([number for number, _ in kept][header:], int)
-    if twice := [name for name in names if names.count(name) > 1]:
-        raise ConfigError(f"{path} has two columns called {twice[0]!r}; expected names that differ")
-    if wrong := [(line, row) for line, row in zip(lines, body, strict=True) if len(row) != len(names)]:
-        line, row = wrong[0]
-        raise ConfigError(f"{path} line {line} has {len(row)} columns; expected {len(names)}, as in its first row")
-    numbers = [[_number(cell) for cell in row] for row in body]
-    texts = {
-        (i, j): body[i][j]
-        for i, row in enumerate(numbers)
-        for j, value in enumerate(row)
-        if value is None and body[i][j]
-    }
-    rows = np.array([[math.nan if v is None else v for v in row] for row in numbers]).reshape(-1, len(names))
-    return Table(str(path), names, rows, lines, "line", texts)
+def loose(name: str) -> str:
+    """A name without its unit in small letters, with spaces for _, for those that are written otherwise."""
+    return plain(name).casefold().replace("_", " ")
 
 
 def of_npz(path: Path, names: Names) -> Table:
     """The table of a file of NumPy arrays: the episodes that we write, or a column an array; 2-D ones are name.0, ...
 
     One array may have the whole observation, and one all controls: see `OBSERVATIONS` and `CONTROLS`. Controls, and
-    times of controls, may be one fewer than observations.
+    times of controls, may be one fewer than observations. The names that our episodes have are their columns'.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -128,8 +103,8 @@ def of_arrays(source: str, arrays: Mapping[str, Any], names: Names) -> Table:
     whole = {}
     for aliases, wanted in ((OBSERVATIONS, names.observation), (CONTROLS, names.control)):
         if (name := next((alias for alias in aliases if alias in found), None)) is not None:
-            width = 1 if found[name].ndim == 1 else found[name].shape[1]
-            whole[name] = wanted if width == len(wanted) else None
+            whole[name] = wanted if _width(found[name]) == len(wanted) else None
+    whole |= _own_names(arrays, found, names)
     columns: dict[str, np.ndarray] = {}
     for name, array in found.items():
         if size - len(array) in (0, 1):
@@ -145,11 +120,26 @@ def of_arrays(source: str, arrays: Mapping[str, Any], names: Names) -> Table:
     return Table(source, tuple(columns), np.column_stack([*columns.values()]), np.arange(size))
 
 
-def _number(cell: str) -> float | None:
-    try:
-        return float(cell)
-    except ValueError:
-        return None
+def _own_names(arrays: Mapping[str, Any], found: Mapping[str, np.ndarray], names: Names) -> dict[str, list[str]]:
+    """Array -> the names of its columns, as the episodes that we write tell them.
+
+    Those of which the environment has none are left out: they are of other times, and the order is what is left.
+    """
+    states, controls = ([*map(str, np.ravel(arrays.get(name, ())))] for name in ("state_names", "control_names"))
+    said = {"x": (states, names.observation), "u": (controls, names.control)}
+    pairs = np.asarray(arrays.get("circles", ()))
+    if pairs.ndim == 2 and "observation" in found and _width(found["observation"]) == len(states) + len(pairs):
+        said["observation"] = (_observed(states, tuple(map(tuple, pairs.tolist()))), names.observation)
+    return {
+        name: own
+        for name, (own, wanted) in said.items()
+        if name in found and _width(found[name]) == len(own) == len({*own})
+        if {*map(loose, own)} & {*map(loose, wanted)}
+    }
+
+
+def _width(array: np.ndarray) -> int:
+    return math.prod(array.shape[1:])
 
 
 def reason(error: Exception) -> str:

@@ -1,0 +1,69 @@
+"""Text files of rows of numbers, CSV, as tables."""
+
+import csv
+import math
+from pathlib import Path
+
+import numpy as np
+
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.logs.table import Table, reason
+
+
+def of_csv(path: Path) -> Table:
+    """The table of a text file, cells apart by commas, semicolons or tabs; a first line that is no numbers is a header.
+
+    Empty lines, and those that begin with #, are left out. Of the latter the last before the first row is a header
+    too if it can be, as NumPy writes it. Raises ConfigError, with the line, for a row of another length.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, ValueError) as error:
+        raise ConfigError(f"{path} cannot be read: {reason(error)}") from error
+    kept = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
+    if not kept:
+        raise ConfigError(f"{path} is empty; expected a header and rows of numbers")
+    comma = next((mark for mark in ",;\t" if mark in kept[0][1]), ",")
+    cells = [_cells(f"{path} line {number}", line, comma) for number, line in kept]
+    remarks = [line for line in text.splitlines()[: kept[0][0] - 1] if line[:1] == "#"]
+    above = [cell.strip() for cell in remarks[-1].lstrip("#").split(comma)] if remarks else []
+    names, header = _header(cells[0], above)
+    body, lines = cells[header:], np.array([number for number, _ in kept][header:], int)
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise ConfigError(f"{path} has two columns called {twice[0]!r}; expected names that differ")
+    if wrong := [(line, row) for line, row in zip(lines, body, strict=True) if len(row) != len(names)]:
+        line, row = wrong[0]
+        raise ConfigError(f"{path} line {line} has {len(row)} columns; expected {len(names)}, as in its first row")
+    numbers = [[_number(cell) for cell in row] for row in body]
+    texts = {
+        (i, j): body[i][j]
+        for i, row in enumerate(numbers)
+        for j, value in enumerate(row)
+        if value is None and body[i][j]
+    }
+    rows = np.array([[math.nan if v is None else v for v in row] for row in numbers]).reshape(-1, len(names))
+    return Table(str(path), names, rows, lines, "line", texts)
+
+
+def _cells(where: str, line: str, comma: str) -> list[str]:
+    row = next(csv.reader([line + "\n"], delimiter=comma))
+    if row[-1].endswith("\n"):  # the quote goes on
+        raise ConfigError(f"{where}: a quote is not closed on its line; expected each cell on one line")
+    return [cell.strip() for cell in row]
+
+
+def _header(first: list[str], above: list[str]) -> tuple[tuple[str, ...], bool]:
+    """The names of the columns, of the first row and the remark above it, and whether that row is them and no data."""
+    numbered = [str(i) for i in range(len(first))]
+    if any(_number(cell) is None for cell in first):
+        return tuple(first), True
+    if len(above) == len(first) and all(cell and _number(cell) is None for cell in above):
+        return tuple(above), False
+    return tuple(numbered), first == numbered  # as pandas writes the columns of an array
+
+
+def _number(cell: str) -> float | None:
+    try:
+        return float(cell)
+    except ValueError:
+        return None
