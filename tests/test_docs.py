@@ -111,8 +111,9 @@ def tools(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     (folder / ".installed").touch()
     for program in (folder / "bin").iterdir():
         program.chmod(0o755)
+    of_make = ("MAKEFLAGS", "MFLAGS", "ARGS")  # of the make that runs these tests, and no words for that of a page
     return {
-        **os.environ,
+        **{name: value for name, value in os.environ.items() if name not in of_make},
         "PATH": f"{folder / 'bin'}:{os.environ['PATH']}",
         "PYTHONPATH": f"{ROOT / 'src'}:{ROOT / 'envs'}",
         "XDG_CACHE_HOME": str(folder / "cache"),

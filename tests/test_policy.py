@@ -204,6 +204,14 @@ def test_a_large_entry_does_not_saturate_a_policy(kind, name):
     assert np.median(given) > 0.1
 
 
+@pytest.mark.parametrize("size", [30.0, 180.0, 1e6])
+def test_the_length_scale_of_a_large_entry_is_its_spread(size):
+    """exp of 89 and more is not finite in float32."""
+    policy, data = KINDS["rbf"](), with_entry(size * np.random.default_rng(0).normal(size=30))
+    params = policy.adapt(policy.init(jax.random.key(0)), data)
+    np.testing.assert_allclose(jax.nn.softplus(params["lengthscales"][:, 0]), np.std(data.x[:30, 0]), rtol=1e-4)
+
+
 def test_the_scaling_of_inputs_is_not_learned():
     policy, data = controller(dropout.none()), with_entry(LARGE["varies"])
     params = policy.adapt(policy.init(jax.random.key(0)), data)

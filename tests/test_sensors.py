@@ -13,9 +13,9 @@ from scipy.signal import savgol_filter
 
 import folders
 from pegasus_jax import memory, tasks
-from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.assembly.experiments import build, compose
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.config import Sensors
+from pegasus_jax.config import Config, Sensors
 from pegasus_jax.episode import run
 from pegasus_jax.exports import as_c, write
 from pegasus_jax.imagine import matching
@@ -111,6 +111,24 @@ def test_rates_afterwards_are_those_of_scipy(length):
         np.testing.assert_allclose(x[: length + 1, 1], truth, rtol=1e-3, atol=1e-3)
     np.testing.assert_array_equal(x[: length + 1, 0], seen[: length + 1, 0].astype(np.float32))
     assert np.isfinite(x[: length + 1]).all()
+
+
+@pytest.mark.parametrize("length", [1, 2, 3, 4])
+def test_rates_of_a_short_episode_are_right_where_they_are_constant(length):
+    """The plant did not stop at its end, though no rows follow."""
+    task, rows = cart(8)._replace(dt=0.1), np.zeros((9, 2), np.float32)
+    rows[: length + 1, 0] = 0.2 * np.arange(length + 1)
+    x, _ = smoothed(jnp.asarray(rows), length, jnp.zeros((8, 1)), task=task)
+    np.testing.assert_allclose(x[: length + 1, 1], 2, rtol=1e-4)
+
+
+@pytest.mark.parametrize("history", [1, 2])
+def test_starts_of_one_s_own_are_those_of_what_is_measured(history):
+    starts = ((0.0, 0.0, 0.0, 0.0), (1.0, 0.0, 0.0, 3.0))
+    config = Config(task="cartpole", sensors=Sensors(measured=(0, 3)), history=history, starts=starts)
+    task = build(config).task
+    np.testing.assert_array_equal(np.asarray(task.starts)[:, :2], [[0, 0], [1, 3]])
+    assert np.shape(task.starts)[1] == np.shape(task.starts_std)[0] == len(task.start_mean)
 
 
 def measured(lengths=(4, 3), capacity=9, seed=0):

@@ -50,7 +50,7 @@ def rbf(
 
     def adapt(params: Params, data: Dataset) -> Params:
         scale = of_data(encode(data.x), data.size).scale
-        before = jnp.log(jnp.expm1(scale))  # a length scale of the data's own size, before softplus
+        before = scale + jnp.log(-jnp.expm1(-scale))  # a length scale of the data's own size, before softplus
         return params | {"lengthscales": jnp.where(scale == 1, params["lengthscales"], before)}
 
     def moments(params: Params, mean: Array, cov: Array) -> Image:

@@ -141,7 +141,10 @@ def smoothed(rows: Array, last: Array | int, controls: Array, *, task: Task) -> 
     times = jnp.arange(len(rows))
     first = jnp.clip(times - WINDOW // 2, 0, jnp.maximum(last - WINDOW + 1, 0))
     around, place = first[:, None] + jnp.arange(WINDOW), jnp.clip(times - first, 0, WINDOW - 1)
-    rates = jnp.einsum("tw,twn->tn", jnp.asarray(weights, q.dtype)[place], q[jnp.minimum(around, last)])
+    # Of an episode shorter than a window the rows beyond its end go on as its last ones did: the plant did not stop.
+    beyond = jnp.maximum(around - last, 0)[..., None] * (q[last] - q[jnp.maximum(last - 1, 0)])
+    windows = q[jnp.minimum(around, last)] + beyond
+    rates = jnp.einsum("tw,twn->tn", jnp.asarray(weights, q.dtype)[place], windows)
     begins = (times[:-1, None] == 0).astype(q.dtype)
     return rows.at[:, np.array(task.rates)].set(rates), begins
 

@@ -156,7 +156,6 @@ def chosen(task: Task, measured: Sequence[int], circles: Circles) -> tuple[Task,
 
     task = task._replace(
         environment=environment._replace(reset=lambda seed: environment.reset(seed)[place], step=step),
-        starts=None if task.starts is None else np.asarray(task.starts)[:, place],
         **_picked(task, keep),
     )
     return task, tuple((keep.index(i), keep.index(j)) for i, j in circles if {i, j} <= {*keep})
@@ -185,11 +184,13 @@ def state_of(rows: np.ndarray, task: Task, sensors: Sensors) -> np.ndarray:
 def _picked(task: Task, kept: Sequence[int]) -> dict[str, Any]:
     """What is known of these entries of a task's state."""
     kept, place = list(kept), np.array(kept)
+    of_each = ("start_mean", "start_std", "sensor_std", "starts", "starts_std")  # the last two may be unknown
+    known = {name: value for name in of_each if (value := getattr(task, name)) is not None}
     return dict(
         angles=tuple(kept.index(i) for i in task.angles if i in kept),
         rates=tuple(kept.index(i) for i in task.rates if i in kept),
         state_names=tuple(task.state_names[i] for i in kept),
-        **{name: np.asarray(getattr(task, name))[place] for name in ("start_mean", "start_std", "sensor_std")},
+        **{name: np.asarray(value)[..., place] for name, value in known.items()},
     )
 
 
