@@ -355,7 +355,7 @@ TINY = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_robot_with_a_constraint(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -47,7 +47,7 @@ def pieces(case: dict, noise: dropout.Dropout, substeps: int) -> tuple:
 
 CASES = [
     pytest.param(DOUBLE, dropout.log_normal(-10.0, 0.0), 2, id="two poles", marks=pytest.mark.slow),
-    pytest.param(SINGLE, dropout.none(), 1, id="one pole, two controls", marks=pytest.mark.slow),
+    pytest.param(SINGLE, dropout.none(), 1, id="one pole, two controls", marks=pytest.mark.campaign),
     pytest.param(RELU, dropout.binary(0.1), 3, id="no pole"),
 ]
 

@@ -389,7 +389,7 @@ def test_another_physics_is_seen_behind_a_delay(tmp_path: Path, monkeypatch: pyt
         tasks.compared(made, task)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_an_arm_learns_behind_late_sensors(tmp_path: Path) -> None:
     tiny = {"model.hidden": [4], "policy.hidden": [4], "search.particles": 16, "search.steps": 2, "fit.steps": 3}
     words = settings(tmp_path, "goals") | tiny | {"trials": 2, "eval_episodes": 1}

@@ -61,7 +61,12 @@ def test_a_film_of_a_tiny_run_replaces_a_link_and_what_it_leads_to_stays(run: Pa
 
 @pytest.mark.parametrize(
     "name",
-    ["cartpole", *(pytest.param(n, marks=pytest.mark.slow) for n in ("double_cartpole", "swimmer_corkscrew")), *MOTORS],
+    [
+        "cartpole",
+        pytest.param("double_cartpole", marks=pytest.mark.campaign),
+        pytest.param("swimmer_corkscrew", marks=pytest.mark.slow),
+        *MOTORS,
+    ],
 )
 def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
     """Also one whose state has a part without entries, as an arm's whose motor has no state of its own."""

@@ -88,9 +88,13 @@ def test_an_unknown_task_is_named() -> None:
         tasks.make("double_cartpol")
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
-    "words", [["task=double_cartpole", "model.substeps=1"], ["task=swimmer_knife_edge", "legs=2"]], ids=" ".join
+    "words",
+    [
+        pytest.param(["task=double_cartpole", "model.substeps=1"], marks=pytest.mark.campaign),
+        pytest.param(["task=swimmer_knife_edge", "legs=2"], marks=pytest.mark.slow),
+    ],
+    ids=" ".join,
 )
 def test_a_tiny_trial_through_the_command_line(words: list[str], tmp_path: Path) -> None:
     run = tmp_path / "run"

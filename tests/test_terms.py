@@ -382,7 +382,7 @@ def hold(x, u, previous_u, goal):
     return 1 - jnp.exp(-away / 0.1) + 0.01 * u[0] ** 2 + 0.02 * (u[0] - previous_u[0]) ** 2
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_robot_with_goals_from_the_first_episode_to_the_file_that_drives_it(tmp_path):
     """What is stored can be counted again by hand, and the file is the controller that was asked for the goal."""
     small = SMALL | {"eval_episodes": "0", "horizon": "6", "env": "Pendulum-v1", "circles": "[[0,1]]"}

@@ -57,7 +57,7 @@ def model(kind):
     }[kind]()
 
 
-@pytest.mark.parametrize("kind", ["bnn", "ensemble"])
+@pytest.mark.parametrize("kind", ["bnn", pytest.param("ensemble", marks=pytest.mark.campaign)])
 def test_a_residual_is_the_simulator_and_what_was_learned_within_what_was_seen(kind):
     """For one particle and for many, with an independent sum; its loss is that of the differences, which wrap."""
     learned, data = model(kind), experience()
@@ -299,7 +299,7 @@ def test_angles_and_periods_of_another_task_are_told(simulator):
     assert any("control_high of cartpole is [10], here [5]" in note or "[10.0], here [5.0]" in note for note in notes)
 
 
-@pytest.mark.slow
+@pytest.mark.campaign
 def test_a_run_that_began_with_another_goes_on_without_it(simulator, tmp_path):
     """Its first episode is by the old policy, which is trial 0 of it; killed after that, it ends as in one piece."""
     old = shutil.copytree(simulator, tmp_path / "old")
