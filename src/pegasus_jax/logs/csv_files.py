@@ -17,21 +17,21 @@ def of_csv(path: Path) -> Table:
     too if it can be, as NumPy writes it. Raises ConfigError, with the line, for a row of another length.
     """
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read: {reason(error)}") from error
-    kept = [(number, line) for number, line in enumerate(text.splitlines(), 1) if line.strip() and line[0] != "#"]
+    kept = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
     if not kept:
         raise ConfigError(f"{path} is empty; expected a header and rows of numbers")
     comma = next((mark for mark in ",;\t" if mark in kept[0][1]), ",")
     cells = [_cells(f"{path} line {number}", line, comma) for number, line in kept]
-    remarks = [line for line in text.splitlines()[: kept[0][0] - 1] if line[:1] == "#"]
+    remarks = [line for line in lines[: kept[0][0] - 1] if line[:1] == "#"]
     above = [cell.strip() for cell in remarks[-1].lstrip("#").split(comma)] if remarks else []
     names, header = _header(cells[0], above)
-    body, lines = cells[header:], np.array([number for number, _ in kept][header:], int)
+    body, places = cells[header:], np.array([number for number, _ in kept][header:], int)
     if twice := [name for name in names if names.count(name) > 1]:
         raise ConfigError(f"{path} has two columns called {twice[0]!r}; expected names that differ")
-    if wrong := [(line, row) for line, row in zip(lines, body, strict=True) if len(row) != len(names)]:
+    if wrong := [(line, row) for line, row in zip(places, body, strict=True) if len(row) != len(names)]:
         line, row = wrong[0]
         raise ConfigError(f"{path} line {line} has {len(row)} columns; expected {len(names)}, as in its first row")
     numbers = [[_number(cell) for cell in row] for row in body]
@@ -42,7 +42,7 @@ def of_csv(path: Path) -> Table:
         if value is None and body[i][j]
     }
     rows = np.array([[math.nan if v is None else v for v in row] for row in numbers]).reshape(-1, len(names))
-    return Table(str(path), names, rows, lines, "line", texts)
+    return Table(str(path), names, rows, places, "line", texts)
 
 
 def _cells(where: str, line: str, comma: str) -> list[str]:

@@ -157,6 +157,7 @@ def _of_run(found: Compared, group: Group, run: Run) -> list[str]:
 
 
 def best_of(run: Run) -> int | None:
+    """The trial that learned a run's best policy, as every command finds it; None where that is not known."""
     try:
         return restore.best(run.path)
     except RunError:  # of a version that wrote less

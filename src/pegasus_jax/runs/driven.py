@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-from filelock import FileLock, Timeout
 
 from pegasus_jax.checks import RunError
 from pegasus_jax.runs import store
+from pegasus_jax.runs.files import held
 
 if TYPE_CHECKING:
     from pegasus_jax.episode import Episode
@@ -35,11 +35,7 @@ class Driven(NamedTuple):
 def locked(run: Path) -> Iterator[None]:
     """With the right to drive by a run. Raises RunError when another process has it."""
     (run / FOLDER).mkdir(exist_ok=True)
-    guard = FileLock(run / FOLDER / ".lock")
-    try:
-        guard.acquire(timeout=0)
-    except Timeout:
-        raise RunError(f"another pegasus-run drives by {run}; begin when it has ended") from None
+    guard = held(run / FOLDER / ".lock", f"another pegasus-run drives by {run}; begin when it has ended")
     try:
         yield
     finally:

@@ -10,10 +10,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
+from filelock import FileLock, Timeout
+
+from pegasus_jax.checks import RunError
+
 
 def beside(path: Path) -> Path:
     """A new name in the folder of `path`, `.NAME.RANDOM`, for the file that will take its place."""
     return path.with_name(f".{path.name}.{secrets.token_hex(4)}")
+
+
+def held(path: Path, taken: str) -> FileLock:
+    """The lock of a file, held until released. Raises RunError, which says `taken`, where another process has it."""
+    guard = FileLock(path)
+    try:
+        guard.acquire(timeout=0)
+    except Timeout:
+        raise RunError(taken) from None
+    return guard
 
 
 def write_whole(path: Path, write: Callable[[IO[bytes]], object]) -> None:

@@ -31,12 +31,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from filelock import FileLock, Timeout
+from filelock import FileLock
 
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs import facts
-from pegasus_jax.runs.files import strict, write_json, write_whole
+from pegasus_jax.runs.files import held, strict, write_json, write_whole
 from pegasus_jax.runs.machine import about
 
 if TYPE_CHECKING:  # JAX is imported where it is needed: a command names its folder before it waits for that
@@ -122,11 +122,7 @@ def lock(path: Path, *, new: bool = False) -> FileLock:
     Of a `new` run the folder must be unused; that is looked at under the lock, so that of two processes that begin in
     one folder, one gets it. ConfigError tells the other.
     """
-    guard = FileLock(path / ".lock")
-    try:
-        guard.acquire(timeout=0)
-    except Timeout:
-        raise RunError(f"{path} is being written by another process; stop it, or choose another out=") from None
+    guard = held(path / ".lock", f"{path} is being written by another process; stop it, or choose another out=")
     try:
         unused(path) if new else existing(path)
     except BaseException:
