@@ -11,8 +11,8 @@ import pytest
 
 from pegasus_jax import config_used, preset
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.config import KINDS, TASKS, Config
-from pegasus_jax.presets import ALGORITHMS, MODELS, NETWORKS, POLICIES, PRESETS, WORDS, own
+from pegasus_jax.config import GYM, KINDS, MJCF, TASKS, Config, uses
+from pegasus_jax.presets import ALGORITHMS, DEFAULT, FOR_ANY, MODELS, NETWORKS, POLICIES, PRESETS, WORDS, own
 from pegasus_jax.runs import config_io
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -36,7 +36,7 @@ def test_the_first_preset_is_the_first_command():
 def test_a_preset_is_one_of_its_own_task_and_says_all(name):
     """Nothing that it leaves to the defaults of a class is changed by a word that names it."""
     assert parse(f"preset={name}") == PRESETS[name] == preset(name)
-    assert name.startswith(PRESETS[name].task)
+    assert name in FOR_ANY or name.startswith(PRESETS[name].task)
     begun = config_io.plain(PRESETS[name])
     aloud = {key: value for key, value in begun.items() if not key.endswith("kind") or key == "explore.kind"}
     assert config_io.override(PRESETS[name], aloud) == PRESETS[name]
@@ -47,6 +47,23 @@ def test_legs_choose_the_swimmers_preset(task):
     assert parse(f"task={task} legs=2") == preset(task)
     assert parse(f"task={task} legs=6") == preset(own(task, 6))
     assert (preset(task).legs, preset(own(task, 6)).legs) == (2, 6)
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_any_task_can_begin_with_the_default(task):
+    """And keeps it: a word such as model= changes a section of it, and not another preset."""
+    begun = parse(f"preset=default task={task}")
+    assert begun == dataclasses.replace(DEFAULT, task=task)
+    mechanism = parse(f"preset=default task={task} model=lagrangian")
+    assert (mechanism.policy, mechanism.search) == (DEFAULT.policy, DEFAULT.search)
+    if uses(task, "legs"):
+        assert parse(f"preset=default task={task} legs=6") == dataclasses.replace(begun, legs=6)
+
+
+def test_a_plant_of_your_own_begins_with_the_default():
+    assert {dataclasses.replace(preset(task), task="") for task in (GYM, MJCF)} == {
+        dataclasses.replace(DEFAULT, task="")
+    }
 
 
 # What the words of a command change, by section.

@@ -104,9 +104,9 @@ def swimmer(maneuver: str, legs: int) -> Config:
     )
 
 
-# The expectation of a cost of one's own is a mean over nodes: docs/decisions.md 0018. Such a plant may start anywhere:
-# 0024. It is to hold for longer than an episode: 0023.
-_OWN_PLANT = Config(
+# For any plant. The expectation of a cost of one's own is a mean over nodes: docs/decisions.md 0018. Such a plant may
+# start anywhere: 0024. It is to hold for longer than an episode: 0023.
+DEFAULT = Config(
     model=BNN(hidden=(100, 100)),
     policy=SMALL_POLICY,
     search=Search(
@@ -116,6 +116,7 @@ _OWN_PLANT = Config(
         matching="narrow",
         visited_starts=0.5,
     ),
+    successor="better",  # a robot runs a new policy only where it is expected to be better than the one before
 )
 
 _SWIMMERS = {
@@ -141,7 +142,10 @@ NETWORKS: dict[str, Config] = {
     },
 }
 
+FOR_ANY = ("default",)  # presets that any task can begin with
+
 PRESETS: dict[str, Config] = {
+    "default": DEFAULT,
     "cartpole": CARTPOLE,
     "double_cartpole": DOUBLE_CARTPOLE,
     "double_cartpole_gpu": replace(  # eight policies side by side: docs/decisions.md 0010
@@ -150,9 +154,8 @@ PRESETS: dict[str, Config] = {
         search=replace(DOUBLE_CARTPOLE.search, num_starts=8, particles=96, steps=2000),
     ),
     **_SWIMMERS,
-    # A robot runs a new policy only where it is expected to be better than the one before.
-    GYM: replace(_OWN_PLANT, task=GYM, successor="better"),
-    MJCF: replace(_OWN_PLANT, task=MJCF),
+    GYM: replace(DEFAULT, task=GYM),
+    MJCF: replace(DEFAULT, task=MJCF),
     **NETWORKS,
 }
 
@@ -278,7 +281,7 @@ def network(name: str) -> str:
     """The preset of the same task, and as many legs, that has a network."""
     of = PRESETS[name]
     same = (one for one, config in NETWORKS.items() if (config.task, config.legs) == (of.task, of.legs))
-    return name if name in NETWORKS else next(same, name)
+    return name if name in (*FOR_ANY, *NETWORKS) else next(same, name)
 
 
 def own(task: str, legs: int = 2) -> str:

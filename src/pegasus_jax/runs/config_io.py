@@ -13,7 +13,7 @@ from yaml import YAMLError
 from pegasus_jax.checks import FUNCTION, ConfigError, did_you_mean, expected, shown
 from pegasus_jax.config import KINDS, TASKS, Config, check_spread, uses
 from pegasus_jax.config_used import check_used, leaves
-from pegasus_jax.presets import WORDS, own, preset
+from pegasus_jax.presets import FOR_ANY, WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.removed import refuse, today
 
@@ -55,6 +55,8 @@ def parse(words: Mapping[str, Any], options: Sequence[str] = ()) -> Config:
         task = task or Config.task
         begin = own(task, override(Config(task=task), values(given)).legs if uses(task, "legs") else Config.legs)
     config = preset(begin, **chosen)
+    if begin in FOR_ANY:
+        config = override(config, values(given) | ({} if task is None else {"task": task}))
     if task not in (None, config.task):
         raise ConfigError(f"preset={begin} is for task={config.task}, not task={task}; the nearest is preset={task}")
     known = leaves(config)
