@@ -12,10 +12,11 @@ import jax
 import numpy as np
 import pytest
 
+from benchmarks import once
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.train import check as check_command
 from pegasus_jax.cli.train import understood
-from pegasus_jax.config import Config
+from pegasus_jax.config import Config, Explore
 from pegasus_jax.runs import check
 from pegasus_jax.tasks.cost_check import Facts
 from probes import cart
@@ -74,7 +75,7 @@ TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5"
 def call(name: str, *words: str, cwd: Path) -> tuple[int, str, list[str]]:
     (cwd / "robot.py").write_text(ROBOT)
     program = [sys.executable, "-P", "-c", f"from pegasus_jax.cli.main import {name}; {name}()"]
-    done = subprocess.run([*program, *WORDS, *words], cwd=cwd, capture_output=True, text=True, check=False)
+    done = subprocess.run([*program, *once(*WORDS, *words)], cwd=cwd, capture_output=True, text=True, check=False)
     log = cwd / "asked.log"
     return done.returncode, done.stdout + done.stderr, log.read_text().split() if log.exists() else []
 
@@ -133,8 +134,14 @@ def test_training_notes_what_checking_does(tmp_path: Path) -> None:
     code, said, _ = call("train", *words, "out=run", cwd=tmp_path)
     assert code == 0, said
     notes = [line for line in said.splitlines() if line.startswith("note: ")]
-    assert len(notes) == 4, said
-    for part in ("has dt 0.05", "more than 1: success", "x2 follows from cos(x0)", "the same: x3"):
+    assert len(notes) == 5, said
+    for part in (
+        "has dt 0.05",
+        "more than 1: success",
+        "x2 follows from cos(x0)",
+        "the same: x3",
+        "trials=1 ends before",
+    ):
         assert part in "\n".join(notes)
 
 
@@ -232,7 +239,31 @@ def test_a_period_that_may_be_in_milliseconds_is_noted() -> None:
     assert check.lasting(task._replace(dt=25.0)) == ["an episode of 60 periods of 25 s takes 1500 s; is dt in seconds?"]
 
 
-@pytest.mark.parametrize(("word", "told"), [("seeds=0", "seeds=0 is out of range"), ("final=maybe", "final=maybe is")])
+@pytest.mark.parametrize(
+    ("trials", "random", "told"),
+    [
+        (1, 5, "; trials=6 or more, or explore.trials=1, changes that"),
+        (2, 3, "trials=2 ends before the 3 random episodes of explore.trials=3 do: no policy will be learned"),
+        (5, 5, ""),  # searched after the last one
+        (1, 1, ""),
+        (1, 0, ""),
+    ],
+)
+def test_a_run_that_ends_before_its_first_search_is_noted(trials: int, random: int, told: str) -> None:
+    config = Config(trials=trials, explore=Explore(trials=random))
+    notes = check.before_training(config, cart())
+    assert [told in note for note in notes] == [True] * bool(told)
+
+
+@pytest.mark.parametrize(
+    ("word", "told"),
+    [
+        ("seeds=0", "seeds=0 is out of range"),
+        ("final=maybe", "final=maybe is"),
+        ("mesh=4", "mesh=4 is not of the form SEEDSxPARTICLES"),
+        ("mesh=2x1", "mesh=2x1 cannot share 1 seeds evenly; mesh=1x1"),
+    ],
+)
 def test_what_a_run_would_refuse_the_check_refuses_too(word: str, told: str) -> None:
     for command in (check_command, understood):
         with pytest.raises(ConfigError, match=told):

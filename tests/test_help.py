@@ -160,6 +160,20 @@ def test_the_completion_of_an_unknown_shell_is_refused() -> None:
     assert "did you mean 'bash'" in done.stderr
 
 
+def test_a_word_that_is_given_twice_is_refused_by_every_command(capsys, tmp_path, monkeypatch) -> None:
+    code, text = said(capsys, "task=cartpole", "trials=2", "seed=1", "trials=5")
+    assert (code, text) == (2, "pegasus: trials= is given 2 times, trials=2 and trials=5; give it once\n")
+    assert "given 3 times" in said(capsys, "seed=1", "seed=1", "seed=1")[1]
+    monkeypatch.setattr(main, "_remember_compilations", lambda: None)
+    monkeypatch.chdir(tmp_path)
+    for folder in ("lr=1", "lr=2"):  # as other tools name them
+        (tmp_path / folder).mkdir()
+    assert said(capsys, "env_args.low=1", "env_args.high=1", "lr=1", "lr=2")[0] == 0
+    code = main._code(lambda words: None, ["trials=2"], help.TRAIN, lambda: ["trials=1"])  # PEGASUS_SETTINGS changes it
+    assert (code, capsys.readouterr().err) == (0, "")
+    assert main._code(lambda words: None, ["seed=2"], help.TRAIN, lambda: ["trials=1", "trials=2"]) == 2
+
+
 def test_the_version_is_told_with_what_a_report_of_a_problem_needs(capsys) -> None:
     code, text = said(capsys, "--version")
     assert code == 0

@@ -77,18 +77,18 @@ def test_columns_are_found_by_map_by_name_or_by_order(header, rows, columns, tmp
 def test_names_match_whatever_their_letters_are(columns, found, time):
     every = tuple(columns.split(","))
     table = Table("a.csv", every, np.zeros((3, len(every))), np.arange(3))
-    known, note = layout(table, Names(("position", "pitch rate"), ("torque",), (False, False)), ())
+    known, note = layout(table, Names(("position", "pitch rate"), ("torque",), (False, False)), (), 0.1)
     assert [column.name for column in (*known.observation, *known.control)] == found.split(",")
     assert (known.time and known.time.name, note) == (time, "")
 
 
 def test_a_column_that_is_one_names_own_is_no_other_names():
     names, rows = Names(("t", "T"), ("x",), (False, False)), np.zeros((3, 3))
-    known, _ = layout(Table("a.csv", ("T", "X", "t"), rows, np.arange(3)), names, ())
+    known, _ = layout(Table("a.csv", ("T", "X", "t"), rows, np.arange(3)), names, (), 0.1)
     assert [column.name for column in (*known.observation, *known.control)] == ["t", "T", "X"]
     twice = Table("a.csv", ("T", "X", "x ", "t", "X [m]"), np.zeros((3, 5)), np.arange(3))
     with pytest.raises(ConfigError, match="no column x"):
-        layout(twice, names, ())
+        layout(twice, names, (), 0.1)
 
 
 def test_a_file_without_header_is_read_in_order(tmp_path):

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import pegasus_jax as pg
+from benchmarks import once
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.runs import begin, checkpoint, config_io, store
 from pegasus_jax.runs.restore import restored
@@ -26,7 +27,7 @@ LENGTHS = (12, 5)  # control periods of the logs; the first is longer than a hor
 
 def command(*words: object) -> list[str]:
     program = "from pegasus_jax.cli.main import train; train()"
-    return [sys.executable, "-c", program, *TINY.split(), *map(str, words)]
+    return [sys.executable, "-c", program, *once(*TINY.split(), *words)]
 
 
 @pytest.fixture(scope="module")

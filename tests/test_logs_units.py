@@ -258,3 +258,50 @@ def test_a_file_is_read_once_whatever_the_letters_of_its_suffix(tmp_path, monkey
     (tmp_path / "b.npz").rename(tmp_path / "b.NPZ")
     found, _ = read(["UP.CSV", "*", str(tmp_path / "*.CSV")], CART)
     assert [one.source for one in found] == ["UP.CSV", "b.NPZ"]
+
+
+COLUMNS = np.random.default_rng(0).uniform(-1, 1, (12, 3))  # position, velocity, force of a cart
+COUNT = np.arange(12.0)
+
+
+@pytest.mark.parametrize(
+    ("header", "more", "told", "columns"),
+    [
+        (",a,b,c", [COUNT], "4 columns, (no name), a, b, c; expected 3: x, v, u; the first column looks", "[a,b,c]"),
+        (",0,1,2", [COUNT + 40], "leave it out, with index=False where pandas writes it, or with", "[0,1,2]"),
+        ("", [COUNT], "the first column looks like a row number (0, 1, 2, ...): leave it out", "[1,2,3]"),
+        (",0,1,2,3", [COUNT, 0.3 * COUNT], "row number (0, 1, 2, ...), and 0 like the time: leave", "[1,2,3,t=0]"),
+        ("", [0.3 * COUNT], "expected 3: x, v, u; if 0 is the time, data_columns=[1,2,3,t=0] says so", "[1,2,3,t=0]"),
+        ("q,a,b,c", [300 * COUNT], "if q is the time", "[a,b,c,t=q*0.001]"),
+        ("", [COLUMNS[:, 0]], "4 columns, 0, 1, 2, 3; expected 3: x, v, u; data_columns=[...] says which is which", ""),
+        ("", [np.zeros(12)], "data_columns=[...] says which is which", ""),
+    ],
+)
+def test_a_column_too_many_that_counts_rows_or_is_the_time_is_told(header, more, told, columns, tmp_path):
+    file, rows = str(tmp_path / "a.csv"), np.column_stack([*more, COLUMNS])
+    np.savetxt(file, rows, delimiter=",", header=header, comments="", fmt="%.9g")
+    with pytest.raises(ConfigError) as refused:
+        read([file], cart())
+    assert told in str(refused.value)
+    assert f"data_columns={columns}" in str(refused.value)
+    if columns:  # and what it says to type is read
+        (one, *_), notes = read([file], cart(), config_io.parse({"data_columns": columns}).data_columns)
+        np.testing.assert_allclose(one.trajectory.x[:, 0], COLUMNS[:9, 0], atol=1e-6)
+        assert not any("resampled" in note for note in notes)
+
+
+def test_row_numbers_are_taken_for_no_time_and_are_noted_where_they_are_read(tmp_path):
+    file = str(tmp_path / "a.csv")
+    np.savetxt(file, np.column_stack([COUNT, COLUMNS]), delimiter=",", header=",x,v,u", comments="", fmt="%.9g")
+    (note,) = read([file], cart())[1]
+    assert note.endswith("rows are taken to be dt=0.3 s apart; nothing uses (no name)")
+    np.savetxt(file, np.column_stack([COUNT, COLUMNS[:, 1:]]), delimiter=",", fmt="%.9g")
+    assert "by their order, 0, 1, 2 are x, v, u; 0 looks like a row number" in read([file], cart())[1][0]
+
+
+def test_an_episode_of_one_row_is_left_out_and_said(tmp_path):
+    file = tmp_path / "a.csv"
+    file.write_text("episode,x,v,u\n" + "".join(f"{episode},0,0,0\n" for episode in (1, 1, 1, 2, 3, 3, 4)))
+    found, notes = read([str(file)], cart())
+    assert [len(one.trajectory.u) for one in found] == [2, 1]
+    assert f"{file}: line 5 is an episode of one row (2 such): nothing follows from it; left out" in notes

@@ -191,7 +191,7 @@ def test_bad_settings_are_one_line(changes: dict[str, object], message: str) -> 
     ("parts", "message"),
     [
         ({"motor": ""}, "it has no actuators"),
-        ({"motor": '<motor joint="elbow"/>'}, "actuator 0 has no ctrlrange"),
+        ({"motor": '<motor joint="elbow"/>'}, "actuator u0 has no ctrlrange"),
         ({"geom": 'fluidshape="ellipsoid"'}, "MJX ignores fluidshape"),
         ({"motor": MOTOR + "<nonsense/>"}, "MuJoCo cannot read it"),
         ({"density": '1000" integrator="implicit'}, "MJX cannot simulate it"),

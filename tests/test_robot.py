@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+from benchmarks import once
 from pegasus_envs.gym_plant import env_spec
 from pegasus_jax import controller
 from pegasus_jax.checks import ConfigError
@@ -157,7 +158,7 @@ def test_a_robot_that_fails_ends_the_command_in_one_line(tmp_path: Path) -> None
 )
 def test_a_mistaken_setting_moves_no_robot(wrong: str, says: str, asks: list[str], tmp_path: Path) -> None:
     """One that is opened to be asked what it is like is closed again, in peace, though it was never reset."""
-    code, _, err = call("train", *WORDS, *TINY, wrong, "horizon=5", "out=run", cwd=tmp_path)
+    code, _, err = call("train", *once(*WORDS, *TINY, wrong), "horizon=5", "out=run", cwd=tmp_path)
     assert (code, err.count("\n")) == (2, 1), err
     assert says in err
     assert asked(tmp_path) == asks

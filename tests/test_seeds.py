@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from benchmarks import once
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.runs import machine, programs, store
 from pegasus_jax.runs.programs import Program, over_seeds
@@ -24,7 +25,7 @@ from probes import EMITTERS, PLAIN, cart, tiny, unchecked
 from test_train import TINY, call, fingerprint, program
 
 # Fitted for longer: under a model that has hardly been, every policy costs 1, and Adam follows a gradient's rounding.
-WORDS = [*TINY, "trials=2", "seed=1", "fit.steps=400"]
+WORDS = once(*TINY, "trials=2", "seed=1", "fit.steps=400")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -49,7 +50,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_seed_among_others_leaves_what_it_leaves_alone(study: Path, tmp_path: Path) -> None:
     """The same files with the same numbers, up to the order in which a batched product adds."""
     alone, among = tmp_path / "alone", study / "seed2"
-    assert call("train", *WORDS, "seed=2", f"out={alone}", cwd=tmp_path).returncode == 0
+    assert call("train", *once(*WORDS, "seed=2"), f"out={alone}", cwd=tmp_path).returncode == 0
     files = [
         {str(p.relative_to(run)) for p in run.rglob("*.*") if "events" not in p.name and "checkpoints/" not in str(p)}
         for run in (alone, among)
@@ -182,7 +183,7 @@ def alike(study: Path, other: Path) -> None:
 @pytest.mark.campaign
 def test_devices_that_share_seeds_and_particles_change_nothing(study: Path, tmp_path: Path) -> None:
     """Four devices made of this CPU, two for the seeds and two for the particles; resumed on one device."""
-    folder, words = tmp_path / "mesh", [*WORDS, "trials=1", "seeds=2", "mesh=2x2"]
+    folder, words = tmp_path / "mesh", once(*WORDS, "trials=1", "seeds=2", "mesh=2x2")
     done = call("train", *words, f"out={folder}", cwd=tmp_path, JAX_NUM_CPU_DEVICES="4")
     assert done.returncode == 0, done.stderr
     assert call("train", f"resume={folder}", "trials=2", cwd=tmp_path).returncode == 0

@@ -2,6 +2,7 @@
 
 import itertools
 import shlex
+import string
 import subprocess
 import sys
 from importlib.util import find_spec
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from benchmarks import once
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import check, handle, jobs_of, values
 from pegasus_jax.runs import config_io, store
@@ -60,6 +62,19 @@ def test_every_combination_has_its_own_run() -> None:
     assert jobs[1].run == Path("out/search.grad_clip-1_policy.hidden-5-5/seed1")
 
 
+def test_values_that_differ_in_signs_or_in_letters_alone_have_folders_of_their_own() -> None:
+    found = values("[1,0],[-1,0],[1,-0],1-0,[[1],[0]],x,X,a/b,+1,1,-1,1e-3,1e3," + "y" * 300 + "," + "y" * 301)
+    names = [job.run.name for job in jobs_of({"start_mean": ",".join(found)}, Path("out"))]
+    assert len({name.casefold() for name in names}) == len(found)
+    assert names[:3] == ["start_mean-1-0", "start_mean--1-0", "start_mean-1--0"]
+    for name in names:  # what Windows takes too
+        assert set(name) <= {*"-._~+", *string.ascii_letters, *string.digits}
+        assert len(name) < 100
+        assert not name.endswith((".", " "))
+    with pytest.raises(ConfigError, match="10 settings make a folder's name too long"):
+        jobs_of({f"setting_{i}": f"{'x' * 30},{'y' * 30}" for i in range(10)}, Path("out"))
+
+
 def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
     """So that pegasus-plot draws them together."""
     jobs = jobs_of({"task": "cartpole", "seed": "3-5"}, tmp_path)
@@ -84,6 +99,10 @@ def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
         (["search.particles=3,100"], "search.particles=3 is too few"),
         (["search.grad_clip=1", "clipp=2"], "clipp is not a setting"),
         (["seeds=1,2"], "seeds=1,2 is not a whole number"),
+        (["seeds=4", "mesh=3x1"], "mesh=3x1 cannot share 4 seeds evenly; mesh=1x1"),
+        (["mesh=1x1,4"], "mesh=4 is not of the form SEEDSxPARTICLES"),
+        (["track=none,wanb"], "track=wanb is unknown; did you mean 'wandb'"),
+        (["resume=runs/demo"], "resume is not a setting"),
         (["jobs=0"], "jobs=0 is out of range"),
         (["launcher=slrm"], "did you mean 'slurm'"),
         (["launcher=slurm"], "launcher="),  # neither the extra nor SLURM, or only one of them
@@ -115,7 +134,7 @@ def test_printed_commands_are_those_of_the_runs(tmp_path: Path) -> None:
 @pytest.mark.campaign
 @pytest.mark.skipif(find_spec("submitit") is None, reason="the extra `sweep` is not installed")
 def test_a_sweep_on_this_machine_leaves_ordinary_runs(tmp_path: Path) -> None:
-    done = call(*TINY, "trials=1", "seed=1,2", "jobs=1", "launcher=local", "out=sweep", cwd=tmp_path)
+    done = call(*once(*TINY, "trials=1"), "seed=1,2", "jobs=1", "launcher=local", "out=sweep", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("done: ") == 2
     for seed in (1, 2):

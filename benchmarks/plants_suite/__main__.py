@@ -23,6 +23,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+from benchmarks import once
 from benchmarks.plants_suite.native import MOST
 from benchmarks.plants_suite.plants import PLANTS
 from pegasus_jax.checks import ConfigError, did_you_mean
@@ -51,7 +52,7 @@ def one(
     """One run, learned or gone on with, and what its policies are worth; `error` is the last line of a failure."""
     plant, run, core, began = PLANTS[name], (home / f"{name}-{seed}").absolute(), cores.get(), time.monotonic()
     new = [f"env={plant.env}", *plant.words, f"seed={seed}", f"trials={plant.trials}", "eval_episodes=0", f"out={run}"]
-    task = [f"resume={run}"] if (run / "config.yaml").exists() else ["task=gym", *new, *words]
+    task = [f"resume={run}"] if (run / "config.yaml").exists() else once("task=gym", *new, *words)
     learned = on_core([*PROGRAM, *task], core, 60 * minutes)
     judge = [sys.executable, "-m", "benchmarks.plants_suite.native", str(run), plant.env, str(episodes)]
     judged = on_core(judge, core, None)

@@ -20,6 +20,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import once
 from benchmarks.plants_suite.__main__ import ONE_CORE, core_queue, on_core
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import PROGRAM
@@ -91,7 +92,7 @@ def one(seed: int, home: Path, words: list[str], minutes: float, cores: Any) -> 
     own = [
         f"{name}={module}:{function}" for name, function in (("cost", "cost"), ("constraint", "arm"), ("stop", "stop"))
     ]
-    new = ["task=gym", f"env={ENV}", *own, *WORDS.split(), *words, f"seed={seed}", f"out={run}"]
+    new = once("task=gym", f"env={ENV}", *own, *WORDS.split(), *words, f"seed={seed}", f"out={run}")
     task = [f"resume={run}"] if (run / "config.yaml").exists() else new
     learned = on_core([*PROGRAM, *task], core, 60 * minutes)
     told = on_core([sys.executable, "-m", module, f"judge={run}"], core, None)

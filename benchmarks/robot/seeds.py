@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
+from benchmarks import once
 from benchmarks.plants_suite.__main__ import ONE_CORE, core_queue, on_core
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import PROGRAM
@@ -41,7 +42,7 @@ def learned(options: dict[str, str], words: Sequence[str], command: str) -> list
     cores = core_queue(jobs := int(options.get("jobs", "2")))
     (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
     runs: list[dict[str, Any]] = []
-    words = [*words, f"trials={options['trials']}"]
+    words = once(*words, f"trials={options['trials']}")
     with ThreadPoolExecutor(jobs) as pool:
         seeds = seed_list(options.get("seeds", "100-109"))
         for job in as_completed([pool.submit(one, home / f"seed{s}", words, s, until, cores) for s in seeds]):

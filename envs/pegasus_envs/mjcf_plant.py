@@ -129,7 +129,7 @@ def mechanism(
         start_mean=mean,
         start_std=std,
         state_names=tuple(full_state_names(model)[entry] for entry in entries),
-        control_names=tuple(model.actuator(i).name or f"u{i}" for i in range(model.nu)),
+        control_names=tuple(_control(model, i) for i in range(model.nu)),
         model=model,
         qpos=lambda state: state.qpos,
         rates=_rates(model, entries),
@@ -262,7 +262,7 @@ def _limits(model: mujoco.MjModel, low: Sequence[float], high: Sequence[float]) 
         )
     for i, (least, greatest) in enumerate(zip(lows, highs, strict=True)):
         if not (np.isfinite(least) and np.isfinite(greatest)):
-            name = model.actuator(i).name or i
+            name = _control(model, i)
             raise ValueError(f"actuator {name} has no ctrlrange; give control_low= and control_high=, one an actuator")
         if not least < greatest:
             raise ValueError(f"control_low={least:g} must be less than control_high={greatest:g}")
@@ -277,11 +277,16 @@ def within_range(model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> No
     if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL):
         return
     bottom, top = _ranges(model)
-    for i in np.flatnonzero((low < bottom) | (high > top)):
+    for i in map(int, np.flatnonzero((low < bottom) | (high > top))):
         raise ValueError(
-            f"actuator {model.actuator(i).name or i}: controls from {low[i]:g} to {high[i]:g} are not among its"
+            f"actuator {_control(model, i)}: controls from {low[i]:g} to {high[i]:g} are not among its"
             f" own, from {bottom[i]:g} to {top[i]:g}"
         )
+
+
+def _control(model: mujoco.MjModel, i: int) -> str:
+    """An actuator's name, or what checks, logs and pictures call one without."""
+    return model.actuator(i).name or f"u{i}"
 
 
 def _ranges(model: mujoco.MjModel) -> np.ndarray:

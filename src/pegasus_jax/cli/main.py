@@ -107,13 +107,16 @@ def _code(
 ) -> int:
     """The exit status of a command that nobody stopped."""
     try:
-        words = _of_today([*words, *(always() if words else ())])
+        added = always() if words else ()  # they may change what was typed
+        typed, words = words, _of_today([*words, *added])
         if not words or help.asked(words):
             print(help.help_of(text, words), end="")
             return 0 if words else 2
         if version.asked(words):
             print(version.told(words))
             return 0
+        _once(typed)
+        _once(added)
         _remember_compilations()
         command(words)
     except (ConfigError, RunError) as error:
@@ -133,6 +136,18 @@ def _of_today(words: Sequence[str]) -> list[str]:
     for answer in answers:
         print(f"note: {answer}", file=sys.stderr)
     return today
+
+
+def _once(words: Sequence[str]) -> None:
+    """Raises ConfigError for a word that is given twice, whatever it is given. Folders may have a = in their names."""
+    given: dict[str, list[str]] = {}
+    for word in words:
+        key, equals, _ = word.partition("=")
+        if equals:
+            given.setdefault(key, []).append(word)
+    for key, every in given.items():
+        if len(every) > 1 and not all(map(os.path.exists, every)):
+            raise ConfigError(f"{key}= is given {len(every)} times, {' and '.join(every)}; give it once")
 
 
 def _goes_on() -> str:

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from pegasus_jax.checks import ConfigError, did_you_mean, whole
+from pegasus_jax.cli import train as cli_train
 from pegasus_jax.cli.main import main
 from pegasus_jax.cli.words import MORE
 from pegasus_jax.shell import typed
@@ -43,6 +44,8 @@ examples
 
 OF_TRAIN = ("seeds", "mesh", "track")  # options of pegasus-train
 OPTIONS = (*MORE["pegasus-sweep"], "out", *OF_TRAIN)
+LONG = 60  # letters of a value in a folder's name
+LONGEST = 255  # bytes that file systems let a folder's name have
 MOST = 10_000  # runs of a sweep: beyond is a slip of the keyboard
 YEAR = 365 * 24 * 60  # [min]
 PROGRAM = [sys.executable, "-c", "from pegasus_jax.cli.main import train; train()"]  # pegasus-train, wherever that is
@@ -90,28 +93,51 @@ def jobs_of(words: dict[str, str], out: Path) -> list[Job]:
         raise ConfigError(f"{empty[0]}={words[empty[0]]} has an empty value; for example seed=0,1,2 or seed=0-2")
     if (count := math.prod(map(len, choices.values()))) > MOST:
         raise ConfigError(f"these are {count:,} combinations; a sweep has at most {MOST:,}")
-    swept = [key for key, found in choices.items() if len(found) > 1]
+    for key, found in choices.items():
+        if twice := [value for value, count in Counter(found).items() if count > 1]:
+            raise ConfigError(f"{key}={words[key]} has {twice[0]} twice; give each value once")
+    swept = {key: names_of(found) for key, found in choices.items() if len(found) > 1}
     jobs = []
     for combination in itertools.product(*choices.values()):
         chosen = dict(zip(choices, combination, strict=True))
-        names = [re.sub(r"[^\w.]+", "-", f"{key}-{chosen[key]}").strip("-") for key in swept if key != "seed"]
+        name = "_".join(f"{key}-{swept[key][chosen[key]]}".rstrip("-") for key in swept if key != "seed")
+        if len(name.encode()) > LONGEST:
+            raise ConfigError(
+                f"{len(swept)} settings make a folder's name too long, {name[:LONG]}...; sweep over fewer"
+            )
         seed = [f"seed{chosen['seed']}"] if "seed" in swept else []
-        run = out.joinpath(*(["_".join(names)] if names else []), *seed)
+        run = out.joinpath(*([name] if name else []), *seed)
         jobs.append(Job(run, [*(f"{key}={value}" for key, value in chosen.items()), f"out={run}"]))
     counts = Counter(job.run for job in jobs)
-    if twice := next((run for run, count in counts.items() if count > 1), None):
-        raise ConfigError(f"two combinations would share the folder {twice}; give each value once")
+    if shared := next((run for run, count in counts.items() if count > 1), None):
+        raise ConfigError(f"two combinations would share the folder {shared}; give each value once")
     return jobs
 
 
+def names_of(found: Sequence[str]) -> dict[str, str]:
+    """Value -> what it is called in a folder's name: its letters, numbers and signs, which any file system takes.
+
+    No two are called alike, also where A is a: the second of [1,2] and 1,2 is 1-2~2.
+    """
+    names: dict[str, str] = {}
+    taken: set[str] = set()
+    for value in found:
+        plain = re.sub(r"[^\w.-]+", "-", value.strip("[](){}\"' "))[:LONG].rstrip(".-")
+        every = (plain if number == 1 else f"{plain}~{number}" for number in itertools.count(1))
+        names[value] = next(name for name in every if name.casefold() not in taken)
+        taken.add(names[value].casefold())
+    return names
+
+
 def check(job: Job) -> None:
-    """Raise ConfigError for settings that cannot be, or a folder that holds runs already."""
+    """Raise ConfigError for what pegasus-train would refuse, but for devices that only it asks for."""
     from pegasus_jax import tasks
     from pegasus_jax.assembly.experiments import build, set_precision
     from pegasus_jax.runs import config_io, store
 
-    _, words = config_io.split(job.words, ("out", *OF_TRAIN))
-    config = tasks.resolve(config_io.parse(words, options=OPTIONS))
+    options, settings = config_io.split(job.words, ("out", *OF_TRAIN))
+    asked = cli_train.new(options, settings, OPTIONS)
+    config = tasks.resolve(asked.config)
     set_precision(config)
     build(replace(config, seed=0))
     if store.holds(job.run):

@@ -2,7 +2,7 @@
 
 import math
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,13 +36,28 @@ def understood(words: Sequence[str]) -> tuple[Asked, dict[str, str]]:
             raise ConfigError(f"{name}= names no folder; for example {name}=runs/demo")
     if "resume" in options:
         asked = start.going_on(Path(options["resume"]), {**rest, **{n: options[n] for n in NEW if n in options}})
-    else:
-        config = config_io.parse(rest, options=OPTIONS)
-        asked = start.new(config, options.get("out"), whole("seeds", options.get("seeds", "1")))
+        return _settled(asked, options), options
+    return new(options, rest, OPTIONS), options
+
+
+def new(options: Mapping[str, str], settings: Mapping[str, str], known: Sequence[str]) -> Asked:
+    """The new run, or runs, that options and settings ask for; `known` are the options that a message may name.
+
+    Raises ConfigError for what cannot be.
+    """
+    from pegasus_jax.runs import config_io
+
+    config = config_io.parse(settings, options=known)
+    return _settled(start.new(config, options.get("out"), whole("seeds", options.get("seeds", "1"))), options)
+
+
+def _settled(asked: Asked, options: Mapping[str, str]) -> Asked:
+    """What is asked for, with the options of any run. Raises ConfigError for what they cannot be; opens no device."""
     if options.get("final", "false") not in ("true", "false"):
         raise ConfigError(f"final={options['final']} is neither true nor false")
-    track = trackers.asked(options.get("track"))
-    return asked._replace(final=options.get("final") == "true", track=track), options
+    if "mesh" in options:
+        _shape(options["mesh"], len(asked.runs))
+    return asked._replace(final=options.get("final") == "true", track=trackers.asked(options.get("track")))
 
 
 def _configured(asked: Asked, options: dict[str, str]) -> Any:
@@ -92,17 +107,22 @@ def _join(options: dict[str, str]) -> None:
 
 def _mesh(text: str | None, seeds: int) -> Any:
     """The mesh that mesh=SEEDSxPARTICLES asks for; by default as many devices as share the seeds evenly."""
-
     from pegasus_jax.sharding import evenly, mesh
 
     if text is None:
         return evenly(seeds)
+    shape = _shape(text, seeds)
+    try:
+        return mesh(*shape)
+    except ValueError as error:
+        raise ConfigError(f"mesh={text} {error}") from error
+
+
+def _shape(text: str, seeds: int) -> tuple[int, int]:
+    """The two numbers of mesh=SEEDSxPARTICLES. Raises ConfigError where they are none, or cannot share the seeds."""
     first, cross, second = text.partition("x")
     if not (cross and first.isdecimal() and second.isdecimal() and int(first) and int(second)):
         raise ConfigError(f"mesh={text} is not of the form SEEDSxPARTICLES; for example mesh=4x1")
     if seeds % int(first):
         raise ConfigError(f"mesh={text} cannot share {seeds} seeds evenly; mesh={math.gcd(seeds, int(first))}x{second}")
-    try:
-        return mesh(int(first), int(second))
-    except ValueError as error:
-        raise ConfigError(f"mesh={text} {error}") from error
+    return int(first), int(second)

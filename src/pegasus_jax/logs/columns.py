@@ -71,11 +71,11 @@ def _column(entry: str, text: str) -> Column:
         raise ConfigError(f"{SETTING}: {entry} is not COLUMN*FACTOR; for example x0=angle*0.0174533") from None
 
 
-def layout(table: Table, names: Names, columns: Sequence[str]) -> tuple[Layout, str]:
+def layout(table: Table, names: Names, columns: Sequence[str], dt: float) -> tuple[Layout, str]:
     """Where everything is in a table, and a note where columns' order or a map that names others decided it, or "".
 
     By the map; else by the names; else the observation in order, then the controls. Raises ConfigError where it cannot
-    be told.
+    be told; rows dt [s] apart tell what in it may be the time.
     """
     said, known = mapped(columns, names), (*names.observation, *names.control)
     own = matched([name for name in table.names if name not in {*TIMES, EPISODE} - {*known}], known)
@@ -91,11 +91,12 @@ def layout(table: Table, names: Names, columns: Sequence[str]) -> tuple[Layout, 
         if not own:
             if len(rest) != len(known):
                 raise ConfigError(
-                    f"{table.source} has {len(rest)} columns, {', '.join(rest)}; expected {len(known)}:"
-                    f" {', '.join(known)}; {SETTING}=[...] says which is which"
+                    f"{table.source} has {len(rest)} columns, {some(rest)}; expected {len(known)}:"
+                    f" {', '.join(known)}; {_beside(table, rest, names, None if time else dt)}"
                 )
             said = {name: Column(column) for name, column in zip(known, rest, strict=True)}
-            note = f"by their order, {', '.join(rest)} are {', '.join(known)}"
+            note = f"by their order, {some(rest)} are {', '.join(known)}"
+            note += f"; {some(rest[:1])} looks like a row number (0, 1, 2, ...)" if times.counts(table, rest[0]) else ""
         else:
             said = {name: Column(own.get(name, name)) for name in known}
     for column in (*said.values(), *([time] if time else [])):
@@ -108,6 +109,28 @@ def layout(table: Table, names: Names, columns: Sequence[str]) -> tuple[Layout, 
     return Layout(
         tuple(said[name] for name in names.observation), tuple(said[name] for name in names.control), time, episode
     ), note
+
+
+def _beside(table: Table, columns: Sequence[str], names: Names, dt: float | None) -> str:
+    """What to do about columns that are not as many as names: if what is too many can be told, what to type.
+
+    The first may be the number of its row, as pandas writes it, and one the time, where none is known and dt is there.
+    """
+    known = (*names.observation, *names.control)
+    first = [name for name in columns[:1] if times.counts(table, name)]
+    rest = [name for name in columns if name not in first]
+    time = times.alike(table, rest, dt) if dt and len(rest) == len(known) + 1 else None
+    rest = [name for name in rest if time is None or name != time[0]]
+    if len(rest) != len(known):
+        return f"{SETTING}=[...] says which is which"
+    typed = word(dict(zip(known, map(Column, rest), strict=True)) | ({"t": Column(*time)} if time else {}), names)
+    if not first:
+        return f"if {some(time[:1]) if time else ''} is the time, {typed} says so"
+    also = f", and {some(time[:1])} like the time" if time else ""
+    return (
+        f"the first column looks like a row number (0, 1, 2, ...){also}: leave it out, with index=False where pandas"
+        f" writes it, or with {typed}"
+    )
 
 
 def _same_units(table: Table, said: Mapping[str, Column], names: Names) -> None:
@@ -150,12 +173,14 @@ def untimed(table: Table, where: Layout, names: Names, dt: float) -> str:
     note += f"; nothing uses {some(unused)}" if unused else ""
     if (found := times.alike(table, unused, dt)) is None:
         return note
-    return f"{note}; if {found[0]} is the time, {word({**said, 't': Column(*found)}, names)}"
+    return f"{note}; if {some(found[:1])} is the time, {word({**said, 't': Column(*found)}, names)}"
 
 
 def some(names: Sequence[str]) -> str:
-    """The first of many names, and how many more there are."""
-    return ", ".join(names[:SHOWN]) + (f" and {len(names) - SHOWN} more" if len(names) > SHOWN else "")
+    """The first of many names, and how many more there are; pandas gives a column of row numbers none."""
+    return ", ".join(name or "(no name)" for name in names[:SHOWN]) + (
+        f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    )
 
 
 def matched(columns: Sequence[str], names: Sequence[str]) -> dict[str, str]:

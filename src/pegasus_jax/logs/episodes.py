@@ -48,7 +48,14 @@ def segments(table: Table, where: Layout, task: Task, control: str, note: Note) 
     begins = np.diff(t) < 0
     if where.episode is not None:
         begins |= np.diff(numbers(table, Column(where.episode))) != 0
-    for rows in np.split(np.arange(len(t)), np.flatnonzero(begins) + 1):
+    episodes = np.split(np.arange(len(t)), np.flatnonzero(begins) + 1)
+    alone = [rows[0] for rows in episodes if len(rows) == 1]
+    if alone and len(alone) < len(episodes):  # else the file has no rows that follow each other, which is said of it
+        others = f" ({len(alone)} such)" if len(alone) > 1 else ""
+        note(
+            f"{table.unit} {table.lines[alone[0]]} is an episode of one row{others}: nothing follows from it; left out"
+        )
+    for rows in episodes:
         if len(rows) > 1:
             u = sent[rows] if control == "sent" else np.vstack([sent[rows[1:]], np.full_like(sent[:1], np.nan)])
             _radians(table, rows, observed[rows], where, task)

@@ -64,7 +64,7 @@ def read(
         def note(text: str, source: str = table.source) -> None:
             notes.setdefault(text, []).append(source)
 
-        where, decided = layout(table, names, columns)
+        where, decided = layout(table, names, columns, task.dt)
         if decided:
             note(decided)
         pieces = list(segments(table, where, task, control, note))

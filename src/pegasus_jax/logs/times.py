@@ -41,11 +41,17 @@ def alike(table: Table, unused: Sequence[str], dt: float) -> Named | None:
     """
     steps = {name: np.diff(table.rows[:, table.names.index(name)]) for name in unused if name != EPISODE}
     named = [name for name in steps if {*_words(name)} & NAMED and _share(steps[name], lambda step: step > 0) > SHARE]
-    even = [name for name in steps if _even(steps[name])]
+    even = [name for name in steps if _even(steps[name]) and not counts(table, name)]
     for name in [*named, *even][:1]:
         units = [scale for word in _words(name) if word != "t" and (scale := factor(word, "s"))]
         return name, units[-1] if units else _nearest(float(np.nanmedian(steps[name])), dt)
     return None
+
+
+def counts(table: Table, name: str) -> bool:
+    """Whether a column looks like the number of its row, 0, 1, 2, ...; of rows that were kept of more, from any on."""
+    numbers = table.rows[:, table.names.index(name)]
+    return _share(np.diff(numbers), lambda step: step == 1) > SHARE and float(numbers[0]).is_integer()
 
 
 def _even(steps: np.ndarray) -> bool:

@@ -9,7 +9,7 @@ import numpy as np
 from pegasus_jax import tasks
 from pegasus_jax.assembly.schedules import at_starts, width_of
 from pegasus_jax.checks import ConfigError, shown
-from pegasus_jax.config import Config, Search
+from pegasus_jax.config import Config, Search, first_search
 from pegasus_jax.imagine import costs
 from pegasus_jax.math.circles import entries
 from pegasus_jax.math.units import parted
@@ -32,7 +32,7 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     is looked at first: a mistake in it moves no robot.
     """
     guide.check(config, task)
-    rates = [*slow(task), *lasting(task)]
+    rates = [*unlearned(config), *slow(task), *lasting(task)]
     if config.cost is None and task.constraint is None:
         return rates
     low, high = tasks.observation_limits(config, task)
@@ -61,6 +61,17 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
         *turning(facts, task.state_names),
         *plausible(readings, facts, task.state_names),
         *alike(readings, task.angles, task.state_names),
+    ]
+
+
+def unlearned(config: Config) -> list[str]:
+    """The note on a run that ends before a policy is searched for the first time: one line, or none."""
+    random = config.explore.trials
+    if first_search(config) <= config.trials:
+        return []
+    return [
+        f"trials={config.trials} ends before the {random} random episodes of explore.trials={random} do: no policy will"
+        f" be learned; trials={random + 1} or more, or explore.trials={config.trials}, changes that"
     ]
 
 
