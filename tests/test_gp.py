@@ -246,6 +246,8 @@ def degenerate(name):
         x, u, y = (np.repeat(rows[:5], 5, 0) for rows in (x, u, y))
     elif name == "no noise":
         y = np.stack([x[:, 0], x[:, 1] + u[:, 0], 0 * x[:, 0]], 1)
+    elif name == "no change":
+        y = 0 * x
     size = {"one row": 1, "no rows": 0}.get(name, 25)
     x, u, y = (np.concatenate([rows, 0 * rows]).astype(np.float32) for rows in (x, u, y))
     return Dataset(jnp.asarray(x), jnp.asarray(u), jnp.asarray(y), jnp.int32(size))
@@ -269,11 +271,14 @@ def test_no_data_make_nan(kind):
         image = model.moments(posterior, jnp.ones(6), 0.1 * jnp.eye(6))
         return learner.params, info, moved, image
 
-    for name in ("plain", "constant columns", "repeated rows", "no noise", "one row", "no rows"):
+    for name in ("plain", "constant columns", "repeated rows", "no noise", "no change", "one row", "no rows"):
         params, info, moved, image = everything(degenerate(name))
         for leaf in jax.tree.leaves((params, info, moved, image)):
             assert np.all(np.isfinite(leaf)), name
             assert leaf.dtype in (jnp.float32, jnp.int32)
         assert info.loss <= info.first, name
         assert np.all(np.diag(image.cov) >= 0), name
+        h = kernels.hyper(params)  # of targets that are all equal, too: their squares are numbers
+        assert np.all(h.noise >= kernels.LEAST_NOISE), name
+        assert np.all(h.signal >= kernels.LEAST_NOISE / 2000), name
     assert traces == 1

@@ -198,6 +198,27 @@ def test_a_speed_without_bounds_stays_finite(made_up):
     assert np.all(np.isfinite(slope))
 
 
+def test_a_control_and_a_coordinate_that_never_varied_are_not_seen(data):
+    """A control of .2 beside one that was always .1, and a cart beside where it always was, move nothing else."""
+    model, still = mechanism(controls=2), jnp.full((200, 1), 0.1)
+    seen = data._replace(x=data.x.at[:, 0].set(0.3), u=jnp.concatenate([data.u, still], 1))
+    x, u = seen.x[7], seen.u[7]
+
+    @jax.jit
+    def predicted(x, u):
+        posterior = model.posterior(model.init(jax.random.key(1)), seen)
+        change = lambda x, u: model.apply(posterior, [None, jnp.ones(8)], x, u).mean  # noqa: E731
+        return change(x, u), jax.jacfwd(change, (0, 1))(x, u)
+
+    usual, slopes = predicted(x, u)
+    for there in ((x, u.at[1].add(0.1)), (x.at[0].add(0.1), u)):
+        changed, _ = predicted(*there)
+        np.testing.assert_allclose(changed, usual, rtol=1e-5)
+    assert np.all(np.isfinite(usual))
+    assert all(np.all(np.isfinite(slope)) for slope in slopes)
+    assert np.abs(slopes[1][:, 0]).max() > 0
+
+
 def test_solve_solves():
     lower = jnp.tril(jax.random.normal(jax.random.key(0), (4, 4))) + 2 * jnp.eye(4)
     force = jax.random.normal(jax.random.key(1), (4,))

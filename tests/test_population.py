@@ -12,8 +12,12 @@ import pytest
 from pegasus_jax import config
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.imagine import limits
+from pegasus_jax.imagine.scenarios import Sampler
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.learn.multistart import best_of
+from pegasus_jax.learn.schedule import search_table
+from pegasus_jax.learn.search import Problem, searcher
 from pegasus_jax.types import PolicyOptimizer, TrainState
 from probes import cart, noisy_linear_policy, regression, same, tiny, unchecked
 
@@ -26,7 +30,7 @@ def wells(params, posterior):
 
 
 def descent():
-    """Plain gradient descent, as a searcher without scenarios."""
+    """Plain gradient descent, as a searcher without scenarios; each search begins with a new optimizer."""
     optimizer = optax.sgd(0.02, momentum=0.5)
 
     def run(key, learner, posterior, *, first, steps, earlier=0):
@@ -35,6 +39,8 @@ def descent():
             updates, state = optimizer.update(gradient, learner.optimizer)
             return TrainState(learner.params + updates, state), (value, jnp.abs(gradient))
 
+        renewed = TrainState(learner.params, optimizer.init(learner.params))
+        learner = optax.tree.where(jnp.asarray(first) == 0, renewed, learner)
         learner, (values, norms) = jax.lax.scan(step, learner, None, steps)
         return learner, SearchInfo(values, norms, jnp.int32(0))
 
@@ -105,6 +111,34 @@ def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_
     first, second = members(lasting=False)
     np.testing.assert_allclose(second.optimizer.params[0], begun(first.params[None]).params[0], rtol=1e-6)
     assert not np.any(np.isclose(second.optimizer.params[1:], begun(first.optimizer.params).params[1:], rtol=1e-3))
+
+
+@pytest.mark.parametrize(
+    ("lasting", "went_on", "stayed"),
+    # Rises and falls of the multipliers of the given policy, and of two others that break the constraint.
+    [(False, [2, 2, 2], [-2, 0, 0]), (True, [-2, 2, 2], [-2, 2, 2])],
+)
+def test_a_constraints_multiplier_goes_on_from_search_to_search(lasting, went_on, stayed):
+    """That of the member whose policy it is: of the first, if the policy that it began with went on instead."""
+
+    def value(p, posterior, target, row, multiplier):
+        return -p + 0 * multiplier, jnp.asarray(p > 0.5, float)
+
+    still = Sampler(lambda *_: jnp.zeros(()), lambda *_: jnp.zeros(()))
+    problem = Problem(value, still, optax.sgd(0.0), search_table(3), ascend=partial(limits.ascend, bound=0.5))
+    make = lambda key, given: jax.random.uniform(key, minval=0.7, maxval=0.9)  # noqa: E731
+    best = best_of(searcher(problem), make, num_starts=3, window=1, lasting=lasting)
+    run, own = jax.jit(partial(best.run, steps=3, first=0)), jnp.float32(0.0)
+
+    def rises(learner):
+        return (learner.optimizer.optimizer.multiplier - limits.FIRST) / (3 * limits.RATE * 0.5)
+
+    first, _ = run(jax.random.key(0), TrainState(own, best.init(own)), None)
+    np.testing.assert_allclose(rises(first), [-1, 1, 1], rtol=1e-5)
+    assert first.params > 0.5
+    for given, expected in ((first.params, went_on), (jnp.float32(0.1), stayed)):
+        second, _ = run(jax.random.key(1), first._replace(params=given), None)
+        np.testing.assert_allclose(rises(second), expected, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.models.calibration import calibration
 from pegasus_jax.policies.driver import driver
-from pegasus_jax.policies.rate_limited import before, explored
+from pegasus_jax.policies.rate_limited import before, explored, with_state
 from pegasus_jax.shapes import check_shape
 from pegasus_jax.task import Task
 from pegasus_jax.types import (
@@ -142,11 +142,12 @@ def experiment(
         plan_key, run_key = jax.random.split(key)
         plan = explore(plan_key)
 
-        def control(key: Key, t: Array, x: Array) -> Array:
-            first = explored(task, x[:states], plan[t], before(x, task), jnp)
-            return jnp.where(exploring, first, act(policy_params, key, x))
+        def control(key: Key, t: Array, both: Array) -> Array:
+            seen, x = jnp.split(both, [len(both) - states])
+            first = explored(task, x, plan[t], before(seen, task), jnp)
+            return jnp.where(exploring, first, act(policy_params, key, seen))
 
-        return episode.run(run_key, control, task)
+        return episode.run(run_key, control, with_state(task))
 
     def driven(key: Key, policy_params: Params, exploring: Array | bool) -> Trajectory:
         if isinstance(key, Tracer):

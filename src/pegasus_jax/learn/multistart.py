@@ -22,10 +22,11 @@ def best_of(
     """The searcher that searches from `num_starts` policies under the same scenarios, all of them until the trial ends.
 
     The first is the policy it is given, the others are `make` (key, given policy) at iteration 0 of each trial; or of
-    the first search where they are `lasting`, and then each goes on from trial to trial, whichever is the best. All
-    begin a trial with a new optimizer. The learner's parameters are always those of the member
-    with the lowest mean objective over the last `window` iterations, or as many as there were. Its optimizer is all
-    members: a `TrainState` [num_starts, ...].
+    the first search where they are `lasting`, and then each goes on from trial to trial, whichever is the best. What
+    `searcher` keeps from search to search, such as a constraint's multiplier, is a lasting member's own; the others
+    begin with what the given policy's member knows. The learner's parameters are always those of the member with the
+    lowest mean objective over the last `window` iterations, or as many as there were. Its optimizer is all members: a
+    `TrainState` [num_starts, ...].
     """
 
     def init(params: Params) -> TrainState:
@@ -44,16 +45,20 @@ def best_of(
     ) -> tuple[TrainState, Any]:
         del fresh  # the members have others
 
-        def gathered() -> Params:
+        def gathered() -> TrainState:
             keys = jax.random.split(jax.random.fold_in(key, FRESH), num_starts - 1)
             others = jax.vmap(make, (0, None))(keys, learner.params)
-            return jax.tree.map(lambda own, rest: jnp.concatenate([own[None], rest]), learner.params, others)
+            members = jax.tree.map(lambda own, rest: jnp.concatenate([own[None], rest]), learner.params, others)
+            last = place_of(learner.params, learner.optimizer.params)
+            known = jax.tree.map(lambda leaf: jnp.stack([leaf[last]] * num_starts), learner.optimizer.optimizer)
+            return TrainState(members, known)
 
         def begun() -> TrainState:
-            old = learner.optimizer.params
-            copies = jnp.all(jnp.stack([jnp.all(leaf == leaf[0]) for leaf in jax.tree.leaves(old)]))  # as `init` has it
-            members = jax.lax.cond(copies, gathered, lambda: old) if lasting else gathered()
-            return TrainState(members, jax.vmap(searcher.init)(members))
+            if not lasting:
+                return gathered()
+            old = jax.tree.leaves(learner.optimizer.params)
+            copies = jnp.all(jnp.stack([jnp.all(leaf == leaf[0]) for leaf in old]))  # as `init` has it
+            return jax.lax.cond(copies, gathered, lambda: learner.optimizer)
 
         members = jax.lax.cond(jnp.asarray(first) == 0, begun, lambda: learner.optimizer)
         search = lambda member: searcher.run(key, member, posterior, first=first, steps=steps, earlier=earlier)  # noqa: E731
@@ -64,3 +69,12 @@ def best_of(
         return TrainState(params, members), info
 
     return PolicyOptimizer(init, run)
+
+
+def place_of(params: Params, members: Params) -> Array:
+    """[] the first of the members [N, ...] with these parameters.
+
+    0 where there is none: a policy that went on as it was before a search is the one that member 0 began with.
+    """
+    same = jax.tree.map(lambda own, all_of: jnp.all((all_of == own).reshape(len(all_of), -1), 1), params, members)
+    return jnp.argmax(jnp.all(jnp.stack(jax.tree.leaves(same)), 0))

@@ -8,7 +8,7 @@ import jax.scipy.stats
 import numpy as np
 
 from pegasus_jax.math.angles import encode
-from pegasus_jax.math.normalize import whitener
+from pegasus_jax.math.normalize import Whitener, varied, whitener
 from pegasus_jax.models._lagrangian_components import GREATEST_CHANGE, GREATEST_SPEED, LEAST_MASS, substituted
 from pegasus_jax.models.networks import HEADS, Masks, noisy
 from pegasus_jax.sharding import pallas_allowed
@@ -29,9 +29,9 @@ class Units(NamedTuple):
     """What makes the numbers of a mechanism of order one; from the data as a whole."""
 
     centre: Array  # [n] mean of the coordinates; 0 of angles
-    spread: Array  # [n] their deviation; 1 of angles
+    spread: Array  # [n] their deviation; 1 of angles, infinite of what never varied
     speed: Array  # [n] deviation of the speeds
-    control: Array  # [U] deviation of the controls
+    control: Array  # [U] deviation of the controls; infinite of what never varied
     change: Array  # [D] deviation of a period's change of state
     size: Array  # [] rows these come from
 
@@ -87,12 +87,12 @@ def lagrangian(
 
     def prepare(data: Dataset) -> Units:
         x, u, y = (whitener(rows, data.size, full=False) for rows in (data.x, data.u, data.y))
-        scale, turns = jnp.diagonal(x.root), np.isin(coordinates, angles)
+        turns = np.isin(coordinates, angles)
         return Units(
             centre=jnp.where(turns, 0.0, x.mean[coordinates]),
-            spread=jnp.where(turns, 1.0, scale[coordinates]),
-            speed=scale[moving],
-            control=jnp.diagonal(u.root),
+            spread=jnp.where(turns, 1.0, unit_of(x)[coordinates]),
+            speed=jnp.diagonal(x.root)[moving],
+            control=unit_of(u),
             change=jnp.diagonal(y.root),
             size=data.size,
         )
@@ -182,6 +182,14 @@ def lagrangian(
         sample=lambda key, posterior: network.sample(key, posterior.params["noise"]),
         apply=Vectorized(predict, together),
     )
+
+
+def unit_of(w: Whitener) -> Array:
+    """The deviation of each column [F]; infinite where it never varied: the model does not see it.
+
+    A value a little beside where it always was would be thousands of units away.
+    """
+    return jnp.where(varied(w), jnp.diagonal(w.root), jnp.inf)
 
 
 def within(v: Array, limit: Array | float) -> Array:

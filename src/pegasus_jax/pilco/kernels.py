@@ -19,6 +19,8 @@ from pegasus_jax.math.angles import encode
 from pegasus_jax.math.normalize import Whitener, varied, whiten, whitener
 from pegasus_jax.types import Array, Dataset, Dynamics, Params
 
+LEAST_NOISE = 1e-5  # in standard deviations of the targets
+
 
 class Scaling(NamedTuple):
     """The maps between raw and scaled units; both are diagonal."""
@@ -80,11 +82,13 @@ def hyper(params: Params) -> Hyper:
     """The hyperparameters. The noise variance is bounded below by what the arithmetic can tell from zero.
 
     The bound, 100 machine epsilons of the signal's variance, keeps a kernel matrix of nearly equal rows positive
-    definite: a signal-to-noise ratio of 290 in float32; in float64 it never matters beside the penalty.
+    definite: a signal-to-noise ratio of 290 in float32; in float64 it never matters beside the penalty. Where all
+    targets are equal nothing else bounds signal and noise: the noise stays at LEAST_NOISE, and the penalty keeps the
+    signal near it, before their squares underflow.
     """
     signal = jnp.exp(params["log_signal"])
     bound = 100 * jnp.finfo(signal.dtype).eps * signal**2
-    noise = jnp.sqrt(jnp.exp(2 * params["log_noise"]) + bound)
+    noise = jnp.sqrt(jnp.maximum(jnp.exp(2 * params["log_noise"]) + bound, LEAST_NOISE**2))
     return Hyper(jnp.exp(params["log_lengthscale"]), signal, noise)
 
 

@@ -5,6 +5,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from pegasus_jax.math.angles import difference
 from pegasus_jax.memory import measured
 from pegasus_jax.task import Task
 from pegasus_jax.types import Array, Params, Policy
@@ -45,12 +46,34 @@ def follow(u: Any, before: Any, task: Task, numpy: Any) -> Any:
 
 
 def explored(task: Task, x: Any, plan: Any, before: Any, numpy: Any) -> Any:
-    """The controls [U] of an exploring period: `plan`, added to those of the task's first controller if it has one."""
+    """The controls [U] of an exploring period: `plan`, added to those of the task's first controller if it has one.
+
+    That is given the state x [D]: see `with_state`.
+    """
     u = plan
     if task.guide is not None:
         low, high = numpy.asarray(task.control_low), numpy.asarray(task.control_high)
         u = numpy.clip(numpy.asarray(task.guide(x), plan.dtype) + plan, low, high).astype(plan.dtype)
     return u if task.control_rate is None else follow(u, before, task, numpy)
+
+
+def with_state(task: Task) -> Task:
+    """The task whose policy sees, behind all else, the state [D] that a first controller is given.
+
+    It is that of an environment's rows: rates that no sensor measures are differences of the positions that one does.
+    """
+    memory, positions, rates = task.memory, np.array(measured(task)), np.array(task.rates, int)
+    turning = tuple(place for place, i in enumerate(positions) if i in task.angles)
+
+    def state(m: Any, o: Array) -> Array:
+        if memory.measured is None:
+            return o
+        last = np.array([memory.names.index(f"{task.state_names[i]} 1 before") for i in positions])
+        return o.at[rates].set(difference(o[positions], m[last], turning) / task.dt)
+
+    shown = (*memory.shown, *(f"{name} of a first controller" for name in task.state_names))
+    show = lambda m, o: jnp.concatenate([memory.show(m, o), state(m, o)])  # noqa: E731
+    return task._replace(memory=memory._replace(shown=shown, show=show))
 
 
 def largest_change(task: Task) -> np.ndarray:
