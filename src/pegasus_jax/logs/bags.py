@@ -16,12 +16,13 @@ SUFFIXES = (".mcap", ".db3", ".bag")
 Series = tuple[np.ndarray, np.ndarray]  # times [s], values
 
 
-def of_bag(path: Path, names: Names, columns: Sequence[str]) -> Table:
+def of_bag(path: Path, names: Names, columns: Sequence[str], control: str = "sent") -> Table:
     """The table of a bag: a row for each message of the topic of the observation's first entry.
 
     The map says of each entry a topic and a field, as /joint_states.position.0. Times are when messages were recorded.
-    Other observations are interpolated linearly to the rows' times, and controls are held. Raises ConfigError for
-    topics and fields that are not there.
+    Other observations are interpolated linearly to the rows' times, and controls are those held in the middle of the
+    period after a row, or before it where `control` is "before": a loop sends one a little after it has read. Raises
+    ConfigError for topics and fields that are not there.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -45,9 +46,10 @@ def of_bag(path: Path, names: Names, columns: Sequence[str]) -> Table:
     for name, turning in zip(names.observation, names.turning, strict=True):
         column, factor, _ = said[name]
         table[column] = interpolated(grid, *series[column], turning, abs(2 * np.pi / factor))
+    half = (0.5 if control == "sent" else -0.5) * (np.median(np.diff(grid)) if len(grid) > 1 else 0)
     for name in names.control:
         t, values = series[said[name].name]
-        held = np.searchsorted(t, grid, side="right") - 1
+        held = np.searchsorted(t, grid + half, side="right") - 1
         table[said[name].name] = np.where(held < 0, np.nan, values[held])
     return Table(str(path), tuple(table), np.column_stack([*table.values()]), np.arange(len(grid)), "message")
 

@@ -59,7 +59,7 @@ def read(
     notes: dict[str, list[str]] = {}  # text -> the files of which it is true
     found: list[tuple[Segment, str, tuple[str, ...]]] = []
     names = names_of(task)
-    for table in tables(files, names, columns):
+    for table in tables(files, names, columns, control):
 
         def note(text: str, source: str = table.source) -> None:
             notes.setdefault(text, []).append(source)
@@ -82,7 +82,7 @@ def read(
     return _trajectories(found, task), told
 
 
-def tables(files: Sequence[str], names: Names, columns: Sequence[str]) -> list[Table]:
+def tables(files: Sequence[str], names: Names, columns: Sequence[str], control: str) -> list[Table]:
     """The tables of files, patterns and data sets. Raises ConfigError for what is not there, or of no known kind."""
     found: dict[str, Table] = {}  # of a file that two patterns name there is one
     for name in files:
@@ -95,14 +95,14 @@ def tables(files: Sequence[str], names: Names, columns: Sequence[str]) -> list[T
         for path in paths:
             key = str(bags.whole(path).resolve())
             if key not in found:
-                found[key] = _table(path, names, columns)
+                found[key] = _table(path, names, columns, control)
     return [*found.values()]
 
 
-def _table(path: Path, names: Names, columns: Sequence[str]) -> Table:
+def _table(path: Path, names: Names, columns: Sequence[str], control: str) -> Table:
     suffix = path.suffix.lower()
     if suffix in bags.SUFFIXES or path.is_dir():
-        return bags.of_bag(path, names, columns)
+        return bags.of_bag(path, names, columns, control)
     if suffix == ".npz":
         return of_npz(path, names)
     if suffix in (".csv", ".txt", ".tsv"):
