@@ -7,6 +7,7 @@ import dataclasses
 import json
 import os
 import re
+import runpy
 import shlex
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import benchmarks
 from benchmarks import RESULTS, pictures, readme_table, results_page
 from benchmarks.speed import compare, scaling, timing
 from benchmarks.speed.workloads import SIZES, flop, products, workload
@@ -111,6 +113,21 @@ def test_two_processors_of_one_name_are_told_apart(monkeypatch):
         known = {"flags": "sse", "model": "17", "cpu family": family, "model name": "AMD EPYC"}
         monkeypatch.setattr(machine, "cpu", lambda known=known: known)
         assert machine.about("")["processor"] == said
+
+
+@pytest.mark.slow
+def test_latency_is_measured_of_every_file(tmp_path, monkeypatch):
+    """As its command does it."""
+    monkeypatch.setattr(benchmarks, "RESULTS", tmp_path)
+    words = ["trials=1", "horizon=20", "fit.steps=1", "search.steps=2", "policy.hidden=[4]", "eval_episodes=0"]
+    monkeypatch.setattr("sys.argv", ["latency", *words])
+    runpy.run_module("benchmarks.speed.latency", run_name="__main__")
+    found = {path.stem: json.loads(path.read_text())["rows"] for path in tmp_path.glob("*.json")}
+    assert {name: {*rows} for name, rows in found.items()} == {
+        "latency": {"between steps", "controller"},
+        "latency_exports": {"c", "numpy", "onnx", "stablehlo"},
+    }
+    assert all(0 < row["median_us"] < row["most_us"] for rows in found.values() for row in rows.values())
 
 
 @pytest.mark.parametrize(
