@@ -13,11 +13,11 @@ from folders import TINY, a_run
 from pegasus_envs.cartpole import cartpole
 from pegasus_jax import compose, tasks
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.config import begins_with_policy, first_search
+from pegasus_jax.config import begins_with, first_search
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.models.residual import FURTHEST, differences, on_differences, residual
-from pegasus_jax.runs import begin, check, checkpoint, config_io, restore, store
+from pegasus_jax.runs import begin, check, checkpoint, config_io, logged, restore, store
 from pegasus_jax.runs.train import train
 from pegasus_jax.types import Batch, ModelLearner
 from pegasus_jax.vectorized import for_particles
@@ -203,12 +203,12 @@ def simulator(tmp_path_factory):
 
 def test_words_of_a_beginning_leave_out_random_episodes(simulator):
     assert parse().explore.trials == 1
-    assert (first_search(parse()), begins_with_policy(parse())) == (1, False)
+    assert (first_search(parse()), begins_with(parse(), "policy")) == (1, False)
     config = parse(init=str(simulator))
-    assert (config.explore.trials, first_search(config), begins_with_policy(config)) == (0, 1, True)
+    assert (config.explore.trials, first_search(config), begins_with(config, "policy")) == (0, 1, True)
     assert parse(init=str(simulator), explore__trials="2").explore.trials == 2
     only = parse(init=str(simulator), init_parts="[model]")
-    assert (only.explore.trials, begins_with_policy(only)) == (1, False)
+    assert (only.explore.trials, begins_with(only, "policy")) == (1, False)
     simulated = parse(prior="benchmarks.robot.cartpole_by_hand:low")
     assert (simulated.explore.trials, first_search(simulated)) == (0, 0)
 
@@ -246,7 +246,7 @@ def said(words):
         (dict(init="nowhere"), "init=nowhere: nowhere is not a run"),
         (dict(init="RUN@first"), "names no trial: expected a number, best or last after @"),
         (dict(init="RUN@9"), "has no checkpoint of trial=9; choose from 1, 2, 3"),
-        (dict(init="RUN", init_parts="[data]"), "init_parts=data is not a choice; choices: policy, model"),
+        (dict(init="RUN", init_parts="[cost]"), "init_parts=cost is not a choice; choices: policy, model, data"),
         (dict(init="RUN", policy__hidden="[4]"), "has policy.hidden=[3], and this run [4]; policy.hidden=[3]"),
         (dict(init="RUN", policy="rbf"), "has policy.kind=mlp, and this run rbf; policy=mlp"),
         (dict(init="RUN", init_parts="[model]", model="log_normal"), "has model.kind=lagrangian, and this run bnn"),
@@ -297,6 +297,34 @@ def test_angles_and_periods_of_another_task_are_told(simulator):
     notes = begin.checked(config, task._replace(dt=0.2, control_high=task.control_high / 2))
     assert any("dt of cartpole is 0.1, here 0.2" in note for note in notes)
     assert any("control_high of cartpole is [10], here [5]" in note or "[10.0], here [5.0]" in note for note in notes)
+
+
+@pytest.mark.parametrize(
+    ("parts", "said"),
+    [
+        ("[policy,data]", "begins with the policy of trial 3 and all episodes of cartpole; no episode is random"),
+        ("[data]", "begins with all episodes of cartpole; no episode is random (explore.trials=1)"),
+        ("[policy]", "begins with the policy of trial 3 of cartpole; no episode is random"),
+    ],
+)
+def test_a_check_counts_the_episodes_that_are_taken_over(parts, said, simulator):
+    """Where the policy is not taken over another one may see other things."""
+    wider = {"policy__hidden": "[4]"} if "policy" not in parts else {}
+    told = "\n".join(check.report(parse(init=f"{simulator}@3", init_parts=parts, **wider)))
+    assert said in told
+    assert ("logs of 7.5 s from 3 files are the first data" in told) == ("data" in parts)
+
+
+@pytest.mark.slow
+def test_a_run_learns_from_the_episodes_that_it_takes_over(simulator, tmp_path):
+    """They are copied: its data do not need the other run."""
+    config = parse(init=str(simulator), init_parts="[policy,data]", preset="cartpole_network", trials="1")
+    state = train(config, tmp_path / "run")
+    (trial,) = store.trials(tmp_path / "run")
+    assert (trial["logs"], trial["plant_seconds"], trial["random"]) == (3, 0.0, False)
+    theirs = [store.load_episode(simulator, number).trajectory for number in (1, 2, 3)]
+    np.testing.assert_array_equal(state.data.x[:75], np.concatenate([one.x[:-1] for one in theirs]))
+    assert len(store.numbered(tmp_path / "run" / logged.FOLDER, ".npz")) == 3
 
 
 @pytest.mark.campaign

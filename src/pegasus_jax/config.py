@@ -29,7 +29,7 @@ CONSTANTS = (GYM, "cartpole", "double_cartpole")  # the tasks that have `env_arg
 MATCHINGS = ("always", "narrow", "never")
 COST_ESTIMATORS = ("gaussian", "particles")
 OBSERVATION_NOISES = ("model", "plant")
-INIT_PARTS = ("policy", "model")
+INIT_PARTS = ("policy", "model", "data")
 INITS = ("previous", "better", "fresh", "raced")
 LEGS = (2, 6)
 SUCCESSORS = ("always", "better")
@@ -303,7 +303,7 @@ class Config:
     init: str | None = setting(
         None, "RUN, or RUN@TRIAL: another run with which this one begins, maybe of a simulator", EVERY
     )
-    init_parts: tuple[str, ...] = setting(("policy",), "what is taken from there: policy, model", EVERY)
+    init_parts: tuple[str, ...] = setting(("policy",), "what is taken from there: policy, model, data", EVERY)
 
     def __post_init__(self) -> None:
         checks.typed("", self)
@@ -369,9 +369,9 @@ def first_search(config: Config) -> int:
     return max(config.explore.trials, 0 if config.prior is not None else 1)  # a simulator needs no episode
 
 
-def begins_with_policy(config: Config) -> bool:
-    """Whether a run begins with a policy that has learned already, in another run."""
-    return config.init is not None and "policy" in config.init_parts
+def begins_with(config: Config, part: str) -> bool:
+    """Whether a run begins with the policy, the model or the data of another run."""
+    return config.init is not None and part in config.init_parts
 
 
 def label(config: Config) -> str:

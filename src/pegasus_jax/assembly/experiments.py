@@ -109,7 +109,7 @@ def compose(
         explore_trials=config.explore.trials,
         first_search=settings.first_search(config) if task.prior is None else config.explore.trials,
         refine_successes=searcher is None and refines_successes(config.search),
-        begun=settings.begins_with_policy(config),
+        begun=settings.begins_with(config, "policy"),
         compare=config.successor == "better",
         capacity=capacity(config, task, logged),
     )

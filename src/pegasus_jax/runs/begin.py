@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax.checks import ConfigError, RunError, shown
-from pegasus_jax.config import Config
+from pegasus_jax.config import Config, begins_with
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.memory import seen_names
 from pegasus_jax.runs import checkpoint, config_io, logged, restore, store
@@ -24,8 +24,8 @@ FOLDER = "init"
 
 def source(init: str) -> tuple[Path, int]:
     """The folder and the trial that init=RUN@TRIAL names, the best of init=RUN. Raises ConfigError, in one line."""
-    name, at, text = init.rpartition("@")
-    run, trial = Path(name if at else init), text if at else restore.BEST
+    run, text = logged.named(init)
+    trial = text if "@" in init else restore.BEST
     if trial not in (restore.LAST, restore.BEST) and not trial.isdecimal():
         raise ConfigError(f"init={init} names no trial: expected a number, best or last after @, as init=runs/sim@best")
     try:
@@ -50,7 +50,7 @@ def checked(config: Config, task: Task) -> list[str]:
         return []
     run, trial = source(config.init)
     old, other, _ = read(run, trial, config.init)
-    what, theirs = f"init={config.init}", other.task
+    what, theirs, learned = f"init={config.init}", other.task, [one for one in config.init_parts if one != "data"]
     for name, mine, its in (
         ("states", len(task.state_names), len(theirs.state_names)),
         ("controls", len(task.control_names), len(theirs.control_names)),
@@ -65,10 +65,10 @@ def checked(config: Config, task: Task) -> list[str]:
             f" angles={shown(list(task.angles))}"
         )
     mine, its = (", ".join(seen_names(one)) for one in (task, theirs))
-    if len(seen_names(task)) != len(seen_names(theirs)):
+    if learned and len(seen_names(task)) != len(seen_names(theirs)):
         why = remembered(old, config) or "; say the same sensors., history= and control_rate= words in both runs"
         raise ConfigError(f"{what} has a policy that sees {its}, and here it would see {mine}{why}")
-    for part in config.init_parts:
+    for part in learned:  # data are checked as logs are
         its, mine = (config_io.leaves(getattr(one, part), f"{part}.") for one in (old, config))
         for name in its:
             if its[name] != mine.get(name):
@@ -78,10 +78,13 @@ def checked(config: Config, task: Task) -> list[str]:
         raise ConfigError(
             f"{what} has prior={shown(old.prior)}, and this run {shown(config.prior)}; init_parts=[policy]"
         )
-    names = " and ".join(config.init_parts)
-    random = config.explore.trials
+    parts = [f"the {' and '.join(learned)} of trial {trial}"] * bool(learned)
+    parts += ["all episodes"] * begins_with(config, "data")
+    random = max(0, config.explore.trials - logged.has(config))  # logs take the place of the first
     first = f"{random} random episodes come first" if random else "no episode is random"
-    notes = [f"{what}: begins with the {names} of trial {trial} of {theirs.name}; {first} (explore.trials={random})"]
+    notes = [
+        f"{what}: begins with {' and '.join(parts)} of {theirs.name}; {first} (explore.trials={config.explore.trials})"
+    ]
     for name in ("dt", "control_low", "control_high"):
         mine, its = (np.asarray(getattr(one, name), float) for one in (task, theirs))
         if not np.allclose(mine, its):

@@ -3,6 +3,7 @@
 They are trial 1: they take the place of a first episode of random controls.
 """
 
+import glob
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,7 @@ import numpy as np
 
 from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.checks import RunError
-from pegasus_jax.config import Config
+from pegasus_jax.config import Config, begins_with
 from pegasus_jax.episode import padded
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.logs import compare
@@ -35,6 +36,28 @@ class Logs(NamedTuple):
 
 
 NONE = Logs(0, lambda: [])
+
+
+def named(init: str) -> tuple[Path, str]:
+    """The folder and the trial of init=RUN@TRIAL; "" of init=RUN."""
+    name, at, trial = init.rpartition("@")
+    return Path(name if at else init), trial
+
+
+def files_of(config: Config) -> list[str]:
+    """Where a config's first data are: in the logs that it names, and in the episodes of another run that it takes."""
+    if config.init is None or not begins_with(config, "data"):
+        return [*config.data]
+    run, _ = named(config.init)
+    kept = [
+        run / folder / f"{n:04d}.npz" for folder in (FOLDER, "episodes") for n in store.numbered(run / folder, ".npz")
+    ]
+    return [*config.data, *(glob.escape(str(path)) for path in kept)]
+
+
+def has(config: Config) -> bool:
+    """Whether a run begins with logs."""
+    return bool(config.data) or begins_with(config, "data")
 
 
 def rows(logged: Sequence[Logged]) -> int:
@@ -67,7 +90,7 @@ def load(run: Path) -> list[Logged]:
 
 def of_run(config: Config, run: Path) -> Logs:
     """The logs of a run's folder, where its config says that it has some. Raises RunError as `load` does."""
-    if not config.data:
+    if not has(config):
         return NONE
     lengths = [len(store.arrays(_path(run, number), "u")["u"]) for number in range(1, _count(run) + 1)]
     return Logs(sum(lengths), lambda: load(run))
@@ -75,7 +98,7 @@ def of_run(config: Config, run: Path) -> Logs:
 
 def of_config(config: Config, logs: Sequence[Logged] | None = None) -> Logs:
     """The logs that a config names, `logs` where they were read already. Raises ConfigError for what cannot be."""
-    if not config.data:
+    if not has(config):
         return NONE
     known = read_config(config, build(replace(config, seed=0)).task)[0] if logs is None else logs
     return Logs(rows(known), lambda: list(known))
@@ -83,10 +106,10 @@ def of_config(config: Config, logs: Sequence[Logged] | None = None) -> Logs:
 
 def read_config(config: Config, task: Task) -> tuple[list[Logged], list[str]]:
     """(the episodes that a config names, notes on them: one line each). Raises ConfigError for what cannot be."""
-    if not config.data:
+    if not has(config):
         return [], []
     set_precision(config)
-    found, notes = read(config.data, task, config.data_columns, config.data_control)
+    found, notes = read(files_of(config), task, config.data_columns, config.data_control)
     files = len({one.source for one in found})
     return found, [
         f"logs of {rows(found) * task.dt:g} s from {files} file{'s' * (files > 1)} are the first data",

@@ -17,7 +17,7 @@ from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from pegasus_jax import episode
-from pegasus_jax.config import Config, begins_with_policy, first_search
+from pegasus_jax.config import Config, begins_with, first_search
 from pegasus_jax.experiment import EVALUATE, trial_key
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
@@ -124,7 +124,7 @@ def learn(job: Job, states: RunState, done: int | None = None) -> RunState:
     if done is None and first_search(job.config) == 0 and not job.logs.rows:
         states, found = improved(job, states, 0)
         job.display.line(f"before the first episode  {learned([UNMEASURED | row for row in found])}")
-    if done is None and (first_search(job.config) == 0 or begins_with_policy(job.config)):
+    if done is None and (first_search(job.config) == 0 or begins_with(job.config, "policy")):
         job.writer.ready(states)
     before: list[Row] = []
     changed = [{"cost_since": since} if since > 1 else {} for since in job.cost_since or [1] * len(job.seeds)]
