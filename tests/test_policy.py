@@ -15,7 +15,7 @@ from pegasus_jax.math.angles import encode
 from pegasus_jax.models import dropout
 from pegasus_jax.pilco.rbf import rbf
 from pegasus_jax.policies.linear import linear
-from pegasus_jax.policies.scaled import inherited, scaled
+from pegasus_jax.policies.scaled import scaled
 from pegasus_jax.policies.squash import SQUASHES, sine, to_limits
 from probes import LIMITS, controller, experience, same
 
@@ -248,10 +248,3 @@ def test_units_that_are_found_do_not_depend_on_those_of_the_plant():
 def test_a_large_entry_with_units_that_are_found_is_standardized():
     inputs, _ = adapted(LARGE["varies"])
     np.testing.assert_allclose((inputs[:, 0].mean(), inputs[:, 0].std()), (0, 3), atol=3e-2)
-
-
-def test_a_fresh_policy_among_others_has_the_inputs_of_the_given_one():
-    policy, data = controller(dropout.none()), with_entry(LARGE["constant"])
-    given, fresh = policy.adapt(policy.init(jax.random.key(0)), data), policy.init(jax.random.key(1))
-    assert same(inherited(fresh, given), policy.adapt(fresh, data))
-    assert inherited(3.0, 4.0) == 3.0

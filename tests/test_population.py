@@ -11,6 +11,7 @@ import pytest
 
 from pegasus_jax import config
 from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.assembly.searchers import fresh_policies
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import limits
 from pegasus_jax.imagine.scenarios import Sampler
@@ -49,12 +50,12 @@ def descent():
 
 def found(own, others, key=0, calls=1):
     """(learner, info) of a search of 60 iterations in so many calls."""
-    fresh = lambda key, given: jax.random.choice(key, jnp.asarray(others))  # noqa: E731
-    searcher = best_of(descent(), fresh, num_starts=STARTS, window=STEPS // 20)
+    searcher = best_of(descent(), num_starts=STARTS, window=STEPS // 20)
+    fresh = jax.random.choice(jax.random.key(key), jnp.asarray(others), (STARTS - 1,))
     learner = TrainState(jnp.float32(own), searcher.init(jnp.float32(own)))
     run, info = jax.jit(partial(searcher.run, steps=STEPS // calls)), None
     for call in range(calls):
-        learner, info = run(jax.random.key(key), learner, DEEPER, first=call * (STEPS // calls))
+        learner, info = run(None, learner, DEEPER, first=call * (STEPS // calls), fresh=fresh)
     return learner, info
 
 
@@ -94,14 +95,14 @@ def test_every_search_has_fresh_policies_of_its_own():
 
 
 def test_policies_that_last_go_on_from_search_to_search_and_others_are_fresh_in_each():
-    fresh = lambda key, given: jax.random.uniform(key, minval=-2.0, maxval=2.0)  # noqa: E731
+    draws = jax.random.uniform(jax.random.key(0), (2, STARTS - 1), minval=-2.0, maxval=2.0)
 
     def members(lasting):
-        """After a search of 3 iterations, and after one more, with another key."""
-        searcher = best_of(descent(), fresh, num_starts=STARTS, window=1, lasting=lasting)
+        """After a search of 3 iterations, and after one more, with other fresh policies."""
+        searcher = best_of(descent(), num_starts=STARTS, window=1, lasting=lasting)
         learner = TrainState(jnp.float32(0.3), searcher.init(jnp.float32(0.3)))
-        first, _ = searcher.run(jax.random.key(0), learner, DEEPER, first=0, earlier=0, steps=3)
-        second, _ = searcher.run(jax.random.key(1), first, DEEPER, first=0, earlier=1, steps=3)
+        first, _ = searcher.run(None, learner, DEEPER, first=0, earlier=0, steps=3, fresh=draws[0])
+        second, _ = searcher.run(None, first, DEEPER, first=0, earlier=1, steps=3, fresh=draws[1])
         return first, second
 
     begun = jax.vmap(lambda own: descent().run(None, TrainState(own, descent().init(own)), DEEPER, first=0, steps=3)[0])
@@ -126,18 +127,17 @@ def test_a_constraints_multiplier_goes_on_from_search_to_search(lasting, went_on
 
     still = Sampler(lambda *_: jnp.zeros(()), lambda *_: jnp.zeros(()))
     problem = Problem(value, still, optax.sgd(0.0), search_table(3), ascend=partial(limits.ascend, bound=0.5))
-    make = lambda key, given: jax.random.uniform(key, minval=0.7, maxval=0.9)  # noqa: E731
-    best = best_of(searcher(problem), make, num_starts=3, window=1, lasting=lasting)
+    best = best_of(searcher(problem), num_starts=3, window=1, lasting=lasting)
     run, own = jax.jit(partial(best.run, steps=3, first=0)), jnp.float32(0.0)
 
     def rises(learner):
         return (learner.optimizer.optimizer.multiplier - limits.FIRST) / (3 * limits.RATE * 0.5)
 
-    first, _ = run(jax.random.key(0), TrainState(own, best.init(own)), None)
+    first, _ = run(jax.random.key(0), TrainState(own, best.init(own)), None, fresh=jnp.array([0.7, 0.8]))
     np.testing.assert_allclose(rises(first), [-1, 1, 1], rtol=1e-5)
     assert first.params > 0.5
     for given, expected in ((first.params, went_on), (jnp.float32(0.1), stayed)):
-        second, _ = run(jax.random.key(1), first._replace(params=given), None)
+        second, _ = run(jax.random.key(1), first._replace(params=given), None, fresh=jnp.array([0.75, 0.85]))
         np.testing.assert_allclose(rises(second), expected, rtol=1e-5, atol=1e-5)
 
 
@@ -154,6 +154,13 @@ def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():
     everyone = after.policy.optimizer.params
     members = [jax.tree.map(itemgetter(i), everyone) for i in range(3)]
     assert any(same(after.policy.params, member) for member in members)
+
+
+@pytest.mark.parametrize(
+    ("search", "count"), [(config.Search(), 2), (config.Search(num_starts=4), 3), (config.Analytic(), 2)]
+)
+def test_a_search_is_given_as_many_fresh_policies_as_it_may_ask_for(search, count):
+    assert fresh_policies(search) == count
 
 
 def test_starts_begin_every_search_anew():

@@ -102,6 +102,7 @@ def experiment(
     explore: Callable[[Key], Array],
     explore_trials: int,
     first_search: int,
+    num_fresh: int = 2,
     refine_successes: bool = False,
     begun: bool = False,
     compare: bool,
@@ -114,8 +115,8 @@ def experiment(
     the first time; 0: before the first episode. One that is `begun` has learned elsewhere before that. With `compare` a
     policy whose newest episode succeeded is followed only by one that is expected to cost less.
     `remember(posterior, state)` is what all of them are given in a posterior's place. With an environment instead of a
-    plant in JAX, `episode` and `collect` are not pure, and `drive` is there. With `refine_successes` the search
-    after an episode that succeeded is called with works=True.
+    plant in JAX, `episode` and `collect` are not pure, and `drive` is there. A search is given `num_fresh` policies
+    that know nothing. With `refine_successes` the one after an episode that succeeded is called with works=True.
     """
     states, controls, memory = len(task.state_names), len(task.control_names), task.memory
     see, given, _ = recall.steps(memory)
@@ -209,8 +210,8 @@ def experiment(
 
         # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
         # that knows nothing is the better start.
-        keys = jax.random.split(trial_key(state.key, state.trial, RESTART))
-        fresh = jax.tree.map(lambda *two: jnp.stack(two), *(adapted(policy.init(key), state.data) for key in keys))
+        keys = jax.random.split(trial_key(state.key, state.trial, RESTART), num_fresh)
+        fresh = jax.vmap(lambda key: adapted(policy.init(key), state.data))(keys)
         untrained = (state.trial <= first_search) & (first == 0)
         worked = state.succeeded & (state.policy_trial > 0)  # a policy, and not random controls
         given = state.policy.params  # one that has learned keeps the inputs that it has learned with

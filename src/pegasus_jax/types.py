@@ -181,8 +181,8 @@ class PolicyOptimizer(NamedTuple):
 
     init: Callable[[Params], Any]  # parameters -> the optimizer's state
     # (key, learner, posterior, steps=, first=, earlier=, fresh=) -> (learner, SearchInfo): iterations first .. first +
-    # steps - 1 of the search after `earlier` others; `fresh` are those of two that know nothing [2, ...]. One
-    # that refines also takes works=, whether the newest episode succeeded
+    # steps - 1 of the search after `earlier` others; `fresh` are those of some that know nothing [2, ...],
+    # with policies side by side of more. One that refines also takes works=, whether the newest episode succeeded
     run: Callable[..., tuple[TrainState, Any]]
 
 

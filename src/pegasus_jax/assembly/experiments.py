@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from pegasus_jax import config as settings
 from pegasus_jax import episode, tasks
 from pegasus_jax.assembly.pieces import drawing_rates, dynamics_of, fit_of, policy_of
-from pegasus_jax.assembly.searchers import limits, refines_successes, search_of
+from pegasus_jax.assembly.searchers import fresh_policies, limits, refines_successes, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config_used import check_config
 from pegasus_jax.experiment import Experiment, experiment
@@ -108,6 +108,7 @@ def compose(
         explore=explore_of(config.explore, task),
         explore_trials=config.explore.trials,
         first_search=settings.first_search(config) if task.prior is None else config.explore.trials,
+        num_fresh=fresh_policies(config.search) if searcher is None else 2,
         refine_successes=searcher is None and refines_successes(config.search),
         begun=settings.begins_with(config, "policy"),
         compare=config.successor == "better",

@@ -23,7 +23,6 @@ from pegasus_jax.learn.schedule import SearchTable, search_table
 from pegasus_jax.learn.search import Problem, searcher
 from pegasus_jax.memory import begin, steps
 from pegasus_jax.pilco import search as pilco
-from pegasus_jax.policies.scaled import inherited
 from pegasus_jax.sharding import Spread, together
 from pegasus_jax.task import Task
 from pegasus_jax.tasks.starts import start
@@ -147,8 +146,7 @@ def search_of(
         lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
         # What refines may end with another than its last.
         window = 1 if search.refine_fraction else max(1, search.steps // 20)
-        fresh = lambda key, given: inherited(policy.init(key), given)  # noqa: E731
-        found = best_of(found, fresh, num_starts=search.num_starts, window=window, lasting=lasting)
+        found = best_of(found, num_starts=search.num_starts, window=window, lasting=lasting)
     # A refined policy is good for particles, not for their Gaussian.
     seen_last = matching.keep if refines else match
     imagine = partial(imagined, **pieces, match=seen_last, task=task)
@@ -173,6 +171,11 @@ def tabled(
 
     like = search_table(8, init=init, refine=8)  # of another length, with a race where the real one has it
     return PolicyOptimizer(searches(like).init, run)
+
+
+def fresh_policies(search: settings.Search | settings.Analytic) -> int:
+    """How many policies that know nothing a search is given: two for a race, all but the given one side by side."""
+    return max(2, search.num_starts - 1) if isinstance(search, settings.Search) else 2
 
 
 def refines_successes(search: settings.Search | settings.Analytic) -> bool:

@@ -1,6 +1,5 @@
 """Several policies searched side by side. The best goes on: to the plant, and where they do not last, alone."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -8,12 +7,9 @@ import jax.numpy as jnp
 
 from pegasus_jax.types import Array, Key, Params, PolicyOptimizer, TrainState
 
-FRESH = 2**31 - 1  # what a search's key is folded with for fresh policies; for its scenarios these numbers are small
-
 
 def best_of(
     searcher: PolicyOptimizer,
-    make: Callable[[Key, Params], Params],
     *,
     num_starts: int,
     window: int,
@@ -21,8 +17,8 @@ def best_of(
 ) -> PolicyOptimizer:
     """The searcher that searches from `num_starts` policies under the same scenarios, all of them until the trial ends.
 
-    The first is the policy it is given, the others are `make` (key, given policy) at iteration 0 of each trial; or of
-    the first search where they are `lasting`, and then each goes on from trial to trial, whichever is the best. What
+    The first is the policy it is given, the others are the first of `fresh` at iteration 0 of each trial; or of the
+    first search where they are `lasting`, and then each goes on from trial to trial, whichever is the best. What
     `searcher` keeps from search to search, such as a constraint's multiplier, is a lasting member's own; the others
     begin with what the given policy's member knows. The learner's parameters are always those of the member with the
     lowest mean objective over the last `window` iterations, or as many as there were. Its optimizer is all members: a
@@ -43,12 +39,9 @@ def best_of(
         earlier: Array | int = 0,
         fresh: Params | None = None,
     ) -> tuple[TrainState, Any]:
-        del fresh  # the members have others
-
         def gathered() -> TrainState:
-            keys = jax.random.split(jax.random.fold_in(key, FRESH), num_starts - 1)
-            others = jax.vmap(make, (0, None))(keys, learner.params)
-            members = jax.tree.map(lambda own, rest: jnp.concatenate([own[None], rest]), learner.params, others)
+            several = lambda own, rest: jnp.concatenate([own[None], rest[: num_starts - 1]])  # noqa: E731
+            members = jax.tree.map(several, learner.params, fresh)
             last = place_of(learner.params, learner.optimizer.params)
             known = jax.tree.map(lambda leaf: jnp.stack([leaf[last]] * num_starts), learner.optimizer.optimizer)
             return TrainState(members, known)

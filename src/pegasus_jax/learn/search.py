@@ -55,7 +55,7 @@ def search(
 
     A search that only refines (`only_refines`) begins at the first that does, as 0, and one ends with a round of
     refinement that has gained nothing (learn/rounds.py); what it lacks is NaN in the info [n]. One call of n steps and
-    two of n/2, the second with first=n/2, do the same. `fresh` are two policies [2, ...] that know nothing, for
+    two of n/2, the second with first=n/2, do the same. `fresh` are policies [2, ...] that know nothing, for
     a table that asks for them. Raises ValueError for more iterations than the table has, or no fresh policy.
     """
     table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)

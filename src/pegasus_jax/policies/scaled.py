@@ -5,7 +5,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from pegasus_jax.types import Array, Params
+from pegasus_jax.types import Array
 
 LARGE = 20.0  # root mean square; entries of our own plants reach 9, and are left as they are
 MOST = 3.0  # root mean square of an entry whose unit is found in the data: docs/decisions.md 0040
@@ -49,8 +49,3 @@ def scaled(given: Input, features: Array) -> Array:
     """The inputs [..., F] of features [..., F]; no gradient reaches the scaling."""
     mean, scale = jax.lax.stop_gradient(given)
     return (features - mean) / scale
-
-
-def inherited(fresh: Params, given: Params) -> Params:
-    """Fresh parameters with the input of the given ones, where they have one."""
-    return fresh | {"input": given["input"]} if isinstance(given, dict) and "input" in given else fresh
