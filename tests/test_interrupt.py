@@ -33,7 +33,12 @@ interrupt.end(0 if len(sys.argv) < 2 else int(sys.argv[1]))
 
 def begun(body: str = "done.wait()", closing: str = "pass", before: str = "") -> subprocess.Popen[str]:
     program = COMMAND.format(body=body, closing=closing, before=before)
-    process = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [sys.executable, "-c", program],
+        stdout=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),  # which `nohup` lets us and ours ignore
+    )
     assert process.stdout is not None
     assert process.stdout.readline() == "ready\n"
     return process
