@@ -34,8 +34,10 @@ from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.train import train
 
-TINY = {"fit.steps": "20", "search.steps": "20", "horizon": "200", "trials": "2", "eval_episodes": "5"}
-TINY |= {"policy.hidden": "[200,200]"}  # the default one is narrower: this is the most that a network of ours takes
+TINY = {
+    **{"fit.steps": "20", "search.steps": "20", "horizon": "200", "trials": "2", "eval_episodes": "5"},
+    "policy.hidden": "[200,200]",  # the default one is narrower: this is the most that a network of ours takes
+}
 CALLS = 2000
 gaps: list[float] = []
 

@@ -49,9 +49,8 @@ def files_of(config: Config) -> list[str]:
     if config.init is None or not begins_with(config, "data"):
         return [*config.data]
     run, _ = named(config.init)
-    kept = [
-        run / folder / f"{n:04d}.npz" for folder in (FOLDER, "episodes") for n in store.numbered(run / folder, ".npz")
-    ]
+    kept = [_path(run, number) for number in store.numbered(run / FOLDER, ".npz")]
+    kept += [store.episode_path(run, trial) for trial in store.numbered(run / "episodes", ".npz")]
     return [*config.data, *(glob.escape(str(path)) for path in kept)]
 
 
