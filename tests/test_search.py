@@ -561,3 +561,32 @@ def test_a_search_in_pieces_is_the_same_search_to_the_bit():
     assert info.iterations == 6
     info = info._replace(iterations=None)
     assert same((plain.params, plain.optimizer, expected), (whole.params, whole.optimizer.optimizer, info))
+
+
+@pytest.mark.parametrize("init", ["previous", "fresh"])
+def test_a_search_without_a_refinement_is_whole_where_the_policy_works_too(init):
+    """There is nothing of it to begin with."""
+    found, learner = on_table(search_table(5, init=init), optax.sgd(0.1), value=rowless)
+    run = partial(found.run, jax.random.key(7), posterior=1.0, steps=5, fresh=jnp.full((2, 3), 2.0))
+    searched = {works: run(learner, works=works) for works in (False, True)}
+    assert same(searched[True][0].params, searched[False][0].params)
+    assert same(searched[True][1], searched[False][1])
+    assert int(searched[True][1].iterations) == 5
+
+
+def test_a_search_goes_as_far_in_double_precision(x64):
+    """Its loop counts in 32 bits wherever it begins."""
+    found, learner = on_table(search_table(6, refine=3), optax.sgd(0.1), value=rowless)
+    after, info = found.run(jax.random.key(7), learner, 1.0, steps=6, works=jnp.bool_(True))
+    assert int(info.iterations) == 3
+    assert after.params.dtype == jnp.float64
+
+
+def test_the_plain_search_goes_on_where_a_piece_of_it_has_ended():
+    """What else a trial tells its searcher is of no use to it."""
+    optimizer = optax.adam(0.1)
+    whole, _ = pursue(optimizer, 6)(jax.random.key(7), begin(optimizer), 1.0)
+    piece, learner = pursue(optimizer, 3), begin(optimizer)
+    for first in (0, 3):
+        learner, _ = piece(jax.random.key(7), learner, 1.0, first=first, earlier=2, fresh=None)
+    np.testing.assert_allclose(learner.params, whole.params, rtol=1e-6)

@@ -1,7 +1,7 @@
 """Policy search as printed (Alg. 3): follow the gradient of the imagined cost under held scenarios."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -30,12 +30,15 @@ def gradient_search(
     sampler: Sampler,
     optimizer: optax.GradientTransformation,
     steps: int,
+    first: Array | int = 0,
+    **_others: Any,
 ) -> tuple[TrainState, SearchInfo]:
     """Alg. 3 as printed: `steps` updates along the gradient of `objective` under the scenarios of each iteration.
 
     The learner is policy parameters and `optimizer.init` of them. `optimizer` has the clip of lines 17 and 18 in it:
     optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-3)). Where the objective or its gradient is not finite, an
-    update changes nothing. The information has an entry for each of the N steps, [N].
+    update changes nothing. The information has an entry for each of the N steps, [N]. With `first` they go on with a
+    search of which so many are done; what else a trial tells its searcher is of no use here.
     """
 
     def step(carry: tuple[TrainState, Scenarios], i: Array) -> tuple[tuple[TrainState, Scenarios], SearchInfo]:
@@ -47,6 +50,6 @@ def gradient_search(
         info = SearchInfo(value, optax.tree.norm(gradient), ~finite)
         return (learner, sampler.redraw(key, i + 1, scenarios, posterior)), info
 
-    begun = learner, sampler.draw(key, jnp.int32(0), posterior)
-    (learner, _), info = jax.lax.scan(step, begun, jnp.arange(steps))
+    begun = learner, sampler.draw(key, jnp.asarray(first, jnp.int32), posterior)
+    (learner, _), info = jax.lax.scan(step, begun, first + jnp.arange(steps, dtype=jnp.int32))
     return learner, info._replace(skipped=jnp.sum(info.skipped))

@@ -67,9 +67,11 @@ def search(
     rows = of_search(table, earlier)
     following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
     learner = optax.tree.where(jnp.asarray(first) == 0, renewed(problem, learner), learner)
-    # Without a word of what works all begin at 0: seeds side by side then have one number, and one loop.
-    skips = problem.works is not False and only_refines(table, learner.optimizer.worked)
-    offset = first + jnp.where(skips, np.sum(~table.refine[begin[:-1]]), 0)
+    # Where nothing refines nothing is skipped. Without a word of what works all begin at 0: seeds side by side then
+    # have one number, and one loop.
+    before = int(np.sum(~table.refine[begin[:-1]]))
+    skips = problem.works is not False and before < most and only_refines(table, learner.optimizer.worked)
+    offset = first + jnp.where(skips, jnp.int32(before), 0)
     row, end = (jnp.asarray(begin)[jnp.minimum(i, most)] for i in (offset, offset + steps))
     count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
 
