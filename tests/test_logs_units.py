@@ -305,3 +305,52 @@ def test_an_episode_of_one_row_is_left_out_and_said(tmp_path):
     found, notes = read([str(file)], cart())
     assert [len(one.trajectory.u) for one in found] == [2, 1]
     assert f"{file}: line 5 is an episode of one row (2 such): nothing follows from it; left out" in notes
+
+
+SAME = CART._replace(state_names=("elbow [rad]", "elbow [rad/s]"), control_names=("elbow",))
+
+
+@pytest.mark.parametrize("header", ["elbow [rad],elbow [rad/s],elbow", "elbow [rad],elbow [rad/s],elbow [N m]"])
+def test_columns_that_differ_in_their_unit_alone_are_told_apart(header, tmp_path):
+    file = written(tmp_path / "a.csv", header, ROWS)
+    np.testing.assert_allclose(first(file, SAME)[0], ROWS[:-1], atol=1e-6)
+    turned = written(tmp_path / "b.csv", ",".join(header.split(",")[::-1]), ROWS[:, ::-1])
+    np.testing.assert_allclose(first(turned, SAME)[0], ROWS[:-1], atol=1e-6)
+
+
+def test_of_columns_that_only_a_unit_would_tell_apart_none_is_taken(tmp_path):
+    file = written(tmp_path / "a.csv", "elbow,rate,u", ROWS)
+    with pytest.raises(ConfigError, match=r"has no column elbow \[rad\], it has elbow, rate, u; data_columns"):
+        read([file], SAME)
+
+
+@pytest.mark.parametrize("names", [("elbow [rad]", "elbow [rad/s]"), ("elbow", "rate")])
+def test_an_episode_of_ours_is_read_back_whatever_a_motor_is_called(names, tmp_path):
+    task, file = SAME._replace(state_names=names), str(tmp_path / "a.npz")
+    ran = Trajectory(ROWS[:, :2], ROWS[:-1, 2:], np.zeros(4))
+    np.savez(file, **store.arrays_of("cart", 1, ran, task, policy=0, ended="truncated"))
+    np.testing.assert_allclose(first(file, task)[0], ROWS[:-1], atol=1e-6)
+
+
+@pytest.mark.parametrize("header", ["Episode,x,v,u", "EPISODE,x,v,u"])
+def test_an_episode_column_may_be_written_in_capitals(header, tmp_path):
+    rows = np.column_stack([[1, 1, 2, 2, 2], ROWS])
+    found, _ = read([written(tmp_path / "a.csv", header, rows)], CART)
+    assert [len(one.trajectory.u) for one in found] == [1, 2]
+    state = CART._replace(state_names=("episode", "v"))
+    assert len(read([written(tmp_path / "b.csv", "episode,v,u", ROWS)], state)[0]) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "rows"),
+    [
+        ("x;v;u\n1,5;-2;0,25\n2,5;3e-1;0\n", [[1.5, -2, 0.25]]),
+        ("1,5;-2;0,25\n2,5;3e-1;0\n", [[1.5, -2, 0.25]]),
+        ("x [m], first;v;u\n1.5;-2;0.25\n2.5;0.3;0\n", [[1.5, -2, 0.25]]),
+        ("1.5,-2,0.25,\n2.5,0.3,0,\n", [[1.5, -2, 0.25]]),
+        ("x,v,u,,\n1.5,-2,0.25,,\n2.5,0.3,0,,\n", [[1.5, -2, 0.25]]),
+    ],
+)
+def test_marks_between_cells_and_in_numbers(text, rows, tmp_path):
+    (tmp_path / "a.csv").write_text(text)
+    np.testing.assert_allclose(first(str(tmp_path / "a.csv"), CART)[0], rows, atol=1e-6)

@@ -82,7 +82,8 @@ def layout(table: Table, names: Names, columns: Sequence[str], dt: float) -> tup
     taken = {column.name for column in said.values()} or {*own.values()}
     found = times.known(table.names, taken)
     time = said.get("t") or (found and Column(*found))
-    episode = said[EPISODE].name if EPISODE in said else EPISODE if EPISODE in table.names else None
+    apart = (name for name in table.names if name.casefold() == EPISODE and name not in taken)
+    episode = said[EPISODE].name if EPISODE in said else next(apart, None)
     called = {column: name for name, column in own.items()}
     other = [f"{c.name} is taken for {n}" for n, c in said.items() if called.get(c.name, n) != n]
     note = f"by {SETTING}=, {', and '.join(other)}" if other else ""
@@ -184,19 +185,17 @@ def some(names: Sequence[str]) -> str:
 
 
 def matched(columns: Sequence[str], names: Sequence[str]) -> dict[str, str]:
-    """Name -> the column of that name, units aside; else the one that differs in case or has _ for a space.
+    """Name -> the column of that name; else the one that differs in its unit, else in case, or has _ for a space.
 
-    A column that some name has exactly is no other's, and of two that are alike neither is taken.
+    A column that is some name exactly is no other's. Of two columns that are alike none is taken, nor for two names.
     """
-    exact = {plain(column): column for column in columns}
-    found = {name: exact[name] for name in names if name in exact}
-    alike: dict[str, list[str]] = {}
-    for column in columns:
-        if column not in found.values():
-            alike.setdefault(loose(column), []).append(column)
-    for name in names:
-        if name not in found and len(alike.get(loose(name), ())) == 1:
-            found[name] = alike[loose(name)].pop()
+    found = {name: name for name in names if name in columns}
+    for form in (plain, loose):
+        columns_left = [form(column) for column in columns if column not in found.values()]
+        names_left = [form(name) for name in names if name not in found]
+        sure = {text for text in names_left if names_left.count(text) == columns_left.count(text) == 1}
+        left = {form(column): column for column in columns if column not in found.values()}
+        found |= {name: left[form(name)] for name in names if name not in found and form(name) in sure}
     return found
 
 

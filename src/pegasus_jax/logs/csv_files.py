@@ -13,6 +13,8 @@ from pegasus_jax.logs.table import Table, reason
 def of_csv(path: Path) -> Table:
     """The table of a text file, cells apart by commas, semicolons or tabs; a first line that is no numbers is a header.
 
+    Between semicolons a decimal comma is one.
+
     Empty lines, and those that begin with #, are left out. Of the latter the last before the first row is a header
     too if it can be, as NumPy writes it. Raises ConfigError, with the line, for a row of another length.
     """
@@ -23,8 +25,12 @@ def of_csv(path: Path) -> Table:
     kept = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
     if not kept:
         raise ConfigError(f"{path} is empty; expected a header and rows of numbers")
-    comma = next((mark for mark in ",;\t" if mark in kept[0][1]), ",")
+    comma = next((mark for mark in ";\t" if mark in kept[0][1]), ",")  # before a comma, which may be a decimal one
     cells = [_cells(f"{path} line {number}", line, comma) for number, line in kept]
+    while len({*map(len, cells)}) == 1 < len(cells[0]) and not any(row[-1] for row in cells):  # of a comma at its end
+        cells = [row[:-1] for row in cells]
+    if comma == ";":  # as where a comma is the decimal mark
+        cells = [[_pointed(cell) for cell in row] for row in cells]
     remarks = [line for line in lines[: kept[0][0] - 1] if line[:1] == "#"]
     above = [cell.strip() for cell in remarks[-1].lstrip("#").split(comma)] if remarks else []
     names, header = _header(cells[0], above)
@@ -55,11 +61,17 @@ def _cells(where: str, line: str, comma: str) -> list[str]:
 def _header(first: list[str], above: list[str]) -> tuple[tuple[str, ...], bool]:
     """The names of the columns, of the first row and the remark above it, and whether that row is them and no data."""
     numbered = [str(i) for i in range(len(first))]
-    if any(_number(cell) is None for cell in first):
+    # Pandas writes the numbers of an array's columns, behind an empty cell over those of its rows.
+    if any(cell and _number(cell) is None for cell in first) or (not first[0] and first[1:] == numbered[:-1]):
         return tuple(first), True
     if len(above) == len(first) and all(cell and _number(cell) is None for cell in above):
         return tuple(above), False
     return tuple(numbered), first == numbered  # as pandas writes the columns of an array
+
+
+def _pointed(cell: str) -> str:
+    """A number with a decimal comma as one with a point; any other cell as it is."""
+    return cell.replace(",", ".") if cell.count(",") == 1 and _number(cell.replace(",", ".")) is not None else cell
 
 
 def _number(cell: str) -> float | None:

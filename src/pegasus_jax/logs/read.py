@@ -4,7 +4,7 @@ import glob
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +20,7 @@ from pegasus_jax.logs.csv_files import of_csv
 from pegasus_jax.logs.episodes import Segment, periods, segments, with_rates
 from pegasus_jax.logs.table import Names, Table, names_of, of_npz
 from pegasus_jax.task import Task
+from pegasus_jax.tasks.terms import goal_names
 from pegasus_jax.types import Array, Trajectory
 
 
@@ -57,8 +58,8 @@ def read(
 ) -> tuple[list[Logged], list[str]]:
     """(the episodes of logs, in parts of at most a horizon; notes on what was decided, one line each)."""
     notes: dict[str, list[str]] = {}  # text -> the files of which it is true
-    found: list[tuple[Segment, str, tuple[str, ...]]] = []
-    names = names_of(task)
+    found: list[tuple[Segment, str, tuple[str, ...], Any]] = []
+    names, goals = names_of(task), goal_names(task)
     for table in tables(files, names, columns, control):
 
         def note(text: str, source: str = table.source) -> None:
@@ -71,7 +72,11 @@ def read(
         if not pieces:
             note("no two rows follow each other; left out")
         used = tuple(map(str, (*where.observation, *where.control)))
-        found += [(one, table.source, used) for piece in pieces if (one := periods(piece, task, note)) is not None]
+        goal = np.array([table.remembered[name] for name in goals]) if {*goals} <= {*table.remembered} else None
+        if goal is None:
+            note("it does not tell the goals of its episodes; one that is drawn stands for all")
+        whole = (one for piece in pieces if (one := periods(piece, task, note)) is not None)
+        found += [(one, table.source, used, goal) for one in whole]
     if not found:
         raise ConfigError(
             f"data={','.join(files)} has no episode: no rows follow each other for a period, {task.dt:g} s"
@@ -110,8 +115,8 @@ def _table(path: Path, names: Names, columns: Sequence[str], control: str) -> Ta
     raise ConfigError(f"data={path} is no log that we read; expected .csv, .npz, {', '.join(bags.SUFFIXES)}")
 
 
-def _trajectories(found: list[tuple[Segment, str, tuple[str, ...]]], task: Task) -> list[Logged]:
-    """Parts of at most H periods, each with its costs and what is remembered at its start.
+def _trajectories(found: Sequence[tuple[Segment, str, tuple[str, ...], Any]], task: Task) -> list[Logged]:
+    """Parts of at most H periods, each with its costs and what is remembered at its start, its goal [G] if it is known.
 
     Raises ConfigError where a cost is not a finite number.
     """
@@ -122,8 +127,12 @@ def _trajectories(found: list[tuple[Segment, str, tuple[str, ...]]], task: Task)
     def known(whole: Trajectory) -> tuple[Array, Array | None]:
         return episode.costs(task, whole), recall.replay(task.memory, whole)
 
-    for one, source, columns in found:
+    places = np.array([task.memory.names.index(name) for name in goal_names(task)], int)
+    for one, source, columns, goal in found:
         x, u, m = with_rates(one.x, task).astype(kind), one.u.astype(kind), None
+        if goal is not None and len(goal):
+            m = np.asarray(recall.begin(task.memory, jax.random.key(0), jnp.asarray(x[0]))).copy()
+            m[places] = goal
         for i in range(0, len(u), size):
             rows = u[i : i + size]
             part = Trajectory(x[i : i + size + 1], rows, np.zeros(len(rows), kind), memory=m)  # type: ignore[arg-type]

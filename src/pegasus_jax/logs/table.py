@@ -31,6 +31,7 @@ class Table(NamedTuple):
     lines: np.ndarray  # [N] what a person calls its rows
     unit: str = "row"  # of the file that a row is
     texts: Texts = MappingProxyType({})  # (row, column) -> what is there instead of a number
+    remembered: Mapping[str, float] = MappingProxyType({})  # name -> what was remembered where it begins, as a goal
 
     def where(self, row: Any) -> str:
         """What to call a row."""
@@ -49,14 +50,32 @@ class Names(NamedTuple):
 def names_of(task: Task) -> Names:
     """The names of what a controller of the task is given, cosines and sines where the state has their angle."""
     given = memory.measured(task)
-    seen = tuple(map(plain, _observed([task.state_names[i] for i in given], task.circles)))
+    observed = _observed([task.state_names[i] for i in given], task.circles)
+    seen, controls = distinct(observed, task.control_names)
     size = len(seen)
     place = dict(zip(circles.entries(size, task.circles), given, strict=True))
     paired = {entry for pair in task.circles for entry in pair}
     turning = tuple(i not in paired and place[i] in task.angles for i in range(size))
-    units = {plain(name): unit for name in (*task.state_names, *task.control_names) if (unit := said(name))}
+    full = zip((*seen, *controls), (*observed, *task.control_names), strict=True)
+    units = {name: unit for name, whole in full if (unit := said(whole))}
     angles = {name: "rad" for name, turns in zip(seen, turning, strict=True) if turns}
-    return Names(seen, tuple(map(plain, task.control_names)), turning, angles | units)
+    return Names(seen, controls, turning, angles | units)
+
+
+def distinct(states: Sequence[str], controls: Sequence[str]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """The names of an observation's and a control's columns, all different: without a unit, unless two then are alike.
+
+    A motor may be called as its joint is, and a rate as its angle is, in another unit.
+    """
+    every = [*states, *controls]
+    short = [*map(plain, every)]
+    names = [one if short.count(one) == 1 else whole for one, whole in zip(short, every, strict=True)]
+    return tuple(names[: len(states)]), _apart(names[: len(states)], names[len(states) :])
+
+
+def _apart(states: Sequence[str], controls: Sequence[str]) -> tuple[str, ...]:
+    """The names of controls, that of one that is called as a state is with a word behind it."""
+    return tuple(f"{name} (control)" if name in states else name for name in controls)
 
 
 def _observed(states: Sequence[str], pairs: circles.Circles) -> list[str]:
@@ -117,7 +136,10 @@ def of_arrays(source: str, arrays: Mapping[str, Any], names: Names) -> Table:
             columns[name][-1] = 2 * columns[name][-2] - columns[name][-3]
     if "dt" in arrays and not {*TIMES} & {*columns}:  # as in the episodes that we write
         columns["t"] = np.arange(size) * float(np.ravel(arrays["dt"])[0])
-    return Table(source, tuple(columns), np.column_stack([*columns.values()]), np.arange(size))
+    first = np.ravel(arrays.get("memory", ()))
+    kept = dict(zip(map(str, np.ravel(arrays.get("memory_names", ()))), first, strict=False))
+    rows = np.column_stack([*columns.values()])
+    return Table(source, tuple(columns), rows, np.arange(size), remembered=kept)
 
 
 def _own_names(arrays: Mapping[str, Any], found: Mapping[str, np.ndarray], names: Names) -> dict[str, list[str]]:
@@ -126,7 +148,7 @@ def _own_names(arrays: Mapping[str, Any], found: Mapping[str, np.ndarray], names
     Those of which the environment has none are left out: they are of other times, and the order is what is left.
     """
     states, controls = ([*map(str, np.ravel(arrays.get(name, ())))] for name in ("state_names", "control_names"))
-    said = {"x": (states, names.observation), "u": (controls, names.control)}
+    said = {"x": (states, names.observation), "u": ([*_apart(states, controls)], names.control)}
     pairs = np.asarray(arrays.get("circles", ()))
     if pairs.ndim == 2 and "observation" in found and _width(found["observation"]) == len(states) + len(pairs):
         said["observation"] = (_observed(states, tuple(map(tuple, pairs.tolist()))), names.observation)

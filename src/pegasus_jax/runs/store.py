@@ -170,7 +170,9 @@ def episode_arrays(
 def arrays_of(name: str, trial: int, episode: Trajectory, task: Task, *, policy: int, ended: str) -> dict[str, Any]:
     """What the file of an episode holds, by name; `name` is the task's, as its run began with it."""
     length = len(episode.u) if episode.length is None else int(episode.length)
-    arrays: dict[str, Any] = {} if episode.memory is None else dict(memory=np.asarray(episode.memory))
+    arrays: dict[str, Any] = {}
+    if episode.memory is not None:
+        arrays = dict(memory=np.asarray(episode.memory), memory_names=task.memory.names)
     arrays |= dict(
         x=np.asarray(episode.x)[: length + 1], u=np.asarray(episode.u)[:length], cost=np.asarray(episode.cost)[:length]
     )
