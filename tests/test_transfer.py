@@ -1,6 +1,7 @@
 """From a simulator to the plant: prior= is the mean of a model, init= begins with another run."""
 
 import shutil
+from dataclasses import replace
 from types import ModuleType
 
 import jax
@@ -8,13 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import pegasus_jax as pg
 from benchmarks.robot import cartpole_by_hand
 from folders import TINY, a_run
 from pegasus_envs.cartpole import cartpole
-from pegasus_jax import compose, tasks
-from pegasus_jax.checks import ConfigError
+from pegasus_jax import build, compose, tasks
+from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import begins_with, first_search
 from pegasus_jax.learn import data as dataset
+from pegasus_jax.logs.read import read
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.models.residual import FURTHEST, differences, on_differences, residual
 from pegasus_jax.runs import begin, check, checkpoint, config_io, logged, restore, store
@@ -343,3 +346,37 @@ def test_a_run_that_began_with_another_goes_on_without_it(simulator, tmp_path):
     (cut / "trials.jsonl").unlink()
     shutil.rmtree(old)
     assert checkpoint.fingerprint(train(config, cut, resume=True)) == checkpoint.fingerprint(whole)
+
+
+def test_a_run_with_a_simulator_is_used_without_it(tmp_path, monkeypatch):
+    """The controller and a file need its policy alone; what would imagine says that the simulator is missing."""
+    module = ModuleType("theirs")
+    module.step = lambda x, u: x
+    monkeypatch.setitem(__import__("sys").modules, "theirs", module)
+    words = dict(prior="theirs:step", model="log_normal", model__hidden="[4]", trials="1", eval_episodes="0")
+    train(parse(**words), tmp_path / "run")
+    monkeypatch.delitem(__import__("sys").modules, "theirs")
+    assert np.isfinite(pg.controller(tmp_path / "run")(np.zeros(4))).all()
+    _, experiment, state = restore.restored(tmp_path / "run")
+    with pytest.raises(RunError, match="imagines with its prior=theirs:step, which is opened with its plant"):
+        experiment.imagine(state)
+
+
+def test_the_goals_of_episodes_that_are_taken_over_are_kept(tmp_path):
+    """For those of logs, which do not tell theirs, one is drawn, and a note says so."""
+    config = replace(parse(trials="3"), cost=lambda x, goal: jnp.abs(x[0] - goal[0]))
+    experiment = build(replace(config, goal_low=(-0.3,), goal_high=(0.3,)))
+    params = experiment.init(jax.random.key(0)).policy.params
+    task, goal = experiment.task, experiment.task.memory.names.index("goal 0")
+    for number in (1, 2):
+        ran = jax.jit(experiment.episode)(jax.random.key(number), params, False)
+        arrays = store.arrays_of("cartpole", number, ran, task, policy=0, ended="horizon")
+        np.savez(tmp_path / f"{number}.npz", **arrays)
+        ((again, *_),), notes = read([str(tmp_path / f"{number}.npz")], task)
+        assert not [note for note in notes if "goals" in note]
+        np.testing.assert_allclose(again.memory[goal], ran.memory[goal])
+        np.testing.assert_allclose(again.cost, ran.cost, atol=0.1)  # of measured states, and of true ones
+    np.savez(tmp_path / "log.npz", **{name: arrays[name] for name in ("x", "u", "dt")})
+    ((other, *_),), notes = read([str(tmp_path / "log.npz")], task)
+    assert other.memory[goal] != pytest.approx(float(ran.memory[goal]))
+    assert [note for note in notes if "it does not tell the goals of its episodes" in note]

@@ -1,4 +1,4 @@
-"""Config -> Experiment: the pieces that the settings name, or your own, composed."""
+"""Config -> Experiment: the pieces that the settings name, or your own, assembled."""
 
 from collections.abc import Callable
 from functools import lru_cache, partial
@@ -13,7 +13,7 @@ from pegasus_jax import config as settings
 from pegasus_jax import episode, tasks
 from pegasus_jax.assembly.pieces import drawing_rates, dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import fresh_policies, limits, refines_successes, search_of
-from pegasus_jax.checks import ConfigError
+from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config_used import check_config
 from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.imagine import visited
@@ -50,7 +50,7 @@ def build(config: settings.Config, mesh: Mesh | None = None, logged: int = 0) ->
 
 @lru_cache(maxsize=64)
 def _built(config: settings.Config, mesh: Mesh | None, logged: int) -> Experiment:
-    return compose(config, _posed(config), mesh=mesh, logged=logged)
+    return assembled(config, _posed(config), mesh=mesh, logged=logged)
 
 
 @lru_cache(maxsize=64)
@@ -76,10 +76,42 @@ def compose(
     `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
     There is room for `logged` rows of data besides those of the trials. Controls of a policy of your own beyond the
     task's limits are cut off at them, in imagination as on the plant. With a `mesh` (sharding.py) the particles of a
-    search are spread over its devices. Raises ConfigError for what is no piece, a task whose fields do not agree, and a
-    piece that does not suit the config: moment matching, for example, needs more particles than states.
+    search are spread over its devices. Raises ConfigError for what is no piece, a task whose fields do not agree, a
+    setting that makes another task than the one given, and a piece that does not suit the config: moment matching, for
+    example, needs more particles than states.
     """
-    _of_kinds(dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher)
+    _of_kinds(config=config, task=task, dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher)
+    _agree(config, task)
+    pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher, cost=cost)
+    return assembled(config, task, mesh=mesh, logged=logged, **pieces)
+
+
+def _agree(config: settings.Config, task: Task) -> None:
+    """Raises ConfigError for a setting that says what the task is, where the task is otherwise."""
+    told: dict[str, Any] = {name: getattr(config, name) for name in ("stop", "constraint", "prior", "reference")}
+    told["goal"] = config.goals or config.goal_low or None
+    missing = [name for name, value in told.items() if value is not None and getattr(task, name) is None]
+    other = [name for name in ("horizon", "dt") if getattr(config, name) not in (None, getattr(task, name))]
+    for name in [*missing, *other]:
+        raise ConfigError(
+            f"the Config has a {name}, and the task {task.name} has {shown(getattr(task, name))}, which is what counts:"
+            f" tasks.of_config(config) makes a task of a Config, task._replace({name}=...) changes one"
+        )
+
+
+def assembled(
+    config: settings.Config,
+    task: Task,
+    *,
+    dynamics: Dynamics | None = None,
+    policy: Policy | None = None,
+    fitter: ModelLearner | None = None,
+    searcher: PolicyOptimizer | None = None,
+    cost: Cost | Callable[..., Array] | None = None,
+    mesh: Mesh | None = None,
+    logged: int = 0,
+) -> Experiment:
+    """`compose` with a task that may know less than its config, as that of a run's folder does."""
     task = remembering(config, checked(task._replace(cost=as_cost(task.cost))))
     task = tasks.whole(task, None if cost is None else as_cost(cost))
     dynamics = dynamics or dynamics_of(config.model, task)
@@ -87,12 +119,12 @@ def compose(
     if task.prior is not None:  # then all of that is of what the simulator gets wrong
         fitter = on_differences(fitter, task.prior, task.angles)
         dynamics = residual(dynamics, task.prior, angles=task.angles)
-    visits = bool(config.search.visited_starts) and searcher is None
+    visits, plain = bool(config.search.visited_starts) and searcher is None, dynamics
     dynamics = visited.remembering(dynamics) if visits else dynamics
     policy = policy_of(config.policy, task) if policy is None else within(policy, task)
     policy = rate_limited(policy._replace(memory=task.memory) if task.memory.names else policy, task)
     searching = search_of(config.search, task, dynamics, policy, over_particles(mesh))
-    return experiment(
+    made = experiment(
         task=task,
         dynamics=dynamics,
         policy=policy,
@@ -114,6 +146,7 @@ def compose(
         compare=config.successor == "better",
         capacity=capacity(config, task, logged),
     )
+    return made._replace(dynamics=plain)  # for others to use: with `visits` the search has another posterior
 
 
 def capacity(config: settings.Config, task: Task, logged: int = 0) -> int:
@@ -134,15 +167,26 @@ def explore_of(explore: settings.Explore, task: Task) -> Callable[[Key], Array]:
     return plan if amplitude is None else lambda key: episode.gently(plan(key), amplitude, low, high)
 
 
-PIECES = {"dynamics": Dynamics, "policy": Policy, "fitter": ModelLearner, "searcher": PolicyOptimizer}
-HELPS = {"fitter": "; minibatches(dynamics, optimizer, batch_size=) makes one", "policy": "; of_pair makes one"}
+PIECES = {
+    "config": settings.Config,
+    "task": Task,
+    "dynamics": Dynamics,
+    "policy": Policy,
+    "fitter": ModelLearner,
+    "searcher": PolicyOptimizer,
+}
+HELPS = {"config": "; preset(NAME) makes one", "task": "; tasks.make(NAME) makes one"} | {
+    "fitter": "; minibatches(dynamics, optimizer, batch_size=) makes one",
+    "policy": "; of_pair makes one",
+}
 
 
 def _of_kinds(**pieces: Any) -> None:
     """Raises ConfigError for a piece of another kind: one of optax, for example, has an `init`, too."""
     for name, piece in pieces.items():
         if piece is not None and not isinstance(piece, kind := PIECES[name]):
-            expected = f"pegasus_jax.{kind.__name__}({', '.join(kind._fields)}){HELPS.get(name, '')}"
+            fields = f"({', '.join(kind._fields)})" if name not in ("config", "task") else ""
+            expected = f"pegasus_jax.{kind.__name__}{fields}{HELPS.get(name, '')}"
             raise ConfigError(f"{name}={type(piece).__name__} is no {kind.__name__}; expected {expected}")
 
 

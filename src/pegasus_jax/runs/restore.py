@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import tasks
-from pegasus_jax.assembly.experiments import compose, set_precision
+from pegasus_jax.assembly.experiments import assembled, set_precision
 from pegasus_jax.checks import ConfigError, RunError, names_code
 from pegasus_jax.config import Config
 from pegasus_jax.episode import verdict
@@ -40,7 +40,7 @@ def restored(run: Path, trial: Trial = LAST, task: Task | None = None) -> tuple[
     """
     config = config_io.load(store.existing(run) / "config.yaml")
     with precision(config):
-        experiment = compose(config, task or store.task_of(run), logged=logged.of_run(config, run).rows)
+        experiment = assembled(config, task or _unplanted(run, config), logged=logged.of_run(config, run).rows)
         like = jax.eval_shape(experiment.init, jax.random.key(0))
         return config, experiment, _state(run, trial, like)
 
@@ -53,6 +53,16 @@ def ready(run: Path, trial: Trial = LAST, mjcf: str | None = None) -> tuple[Conf
     config = moved(run, config_io.load(store.existing(run) / "config.yaml"), mjcf)
     set_precision(config)
     return restored(run, trial, planted(run, config))
+
+
+def _unplanted(run: Path, config: Config) -> Task:
+    """The task of the facts in a run's folder. Where it has a simulator its model is of what that gets wrong."""
+
+    def missing(*_: Any) -> Any:
+        raise RunError(f"{run} imagines with its prior={config.prior}, which is opened with its plant only")
+
+    task = store.task_of(run)
+    return task if config.prior is None else task._replace(prior=missing)
 
 
 def _state(run: Path, trial: Trial, like: RunState) -> RunState:

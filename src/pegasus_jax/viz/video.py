@@ -20,7 +20,7 @@ import numpy as np
 from PIL import Image, ImageOps
 
 from pegasus_jax import episode, tasks
-from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.assembly.experiments import assembled
 from pegasus_jax.checks import RunError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import restore
@@ -96,7 +96,7 @@ def driven(config: Config, params: Params, seeds: range) -> Iterator[tuple[Traje
     """
     task, look, drawn = tasks.of_config(config), tasks.camera(config), list[np.ndarray]()
     watched = task._replace(environment=filmed(task.environment, look, max(1, round(EVERY / task.dt)), drawn))
-    drive: Any = compose(config, watched).drive
+    drive: Any = assembled(config, watched).drive
     for seed in seeds:
         ran = drive(jax.random.key(seed), params, False)
         failed(ran, task, kept=False)
