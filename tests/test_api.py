@@ -540,6 +540,8 @@ WRONG_TASKS = [
     (dict(horizon=10.0), r"the task's horizon=10\.0 is not a whole number"),
     (dict(dt=-0.1), r"the task's dt=-0\.1 is no control period; expected a number of seconds above 0"),
     (dict(dt=float("nan")), r"the task's dt=nan is no control period"),
+    (dict(start_mean=[float("nan"), 0.0]), r"the task's start_mean is \[nan, 0\.0\]; expected finite numbers"),
+    (dict(control_high=[float("inf")]), r"the task's control_high is \[inf\]; expected finite numbers"),
     (
         dict(control_low=[2.0], control_high=[-2.0]),
         r"the task's limits of force are 2 and -2; expected control_low first",
@@ -754,3 +756,63 @@ def loaded(code: str) -> set[str]:
     code += "\nimport sys; print(*{name.partition('.')[0] for name in sys.modules})"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     return set(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        (
+            dict(horizon=7),
+            r"the Config has a horizon, and the task .* has 5, which .*task\._replace\(horizon=",
+        ),
+        (dict(dt=0.4), r"the Config has a dt"),
+        (dict(stop=lambda x: x[0] > 1), r"the Config has a stop, and the task .* has null"),
+        (dict(constraint=lambda x: x[0] - 1), r"the Config has a constraint"),
+        (dict(goal_low=(-1.0,), goal_high=(1.0,)), r"the Config has a goal"),
+        (dict(reference=lambda t: t), r"the Config has a reference"),
+    ],
+)
+def test_a_setting_that_makes_another_task_is_not_dropped(settings: dict[str, Any], message: str) -> None:
+    task = TASK._replace(horizon=5)
+    with pytest.raises(pg.ConfigError, match=f"^{message}"):
+        pg.compose(replace(CONFIG, **settings), task)
+    pg.compose(replace(CONFIG, horizon=5, dt=task.dt), task)
+
+
+def test_what_is_no_config_or_no_task_is_one_line() -> None:
+    for given, says in (((TASK, CONFIG), "config=Task is no Config"), ((CONFIG, "cartpole"), "task=str is no Task")):
+        with pytest.raises(pg.ConfigError, match=f"^{says}; expected pegasus_jax"):
+            pg.compose(*given)  # type: ignore[arg-type]
+
+
+def test_the_dynamics_of_an_experiment_have_their_own_posterior() -> None:
+    """Also where its search starts from visited states, and then knows more of one."""
+    config = replace(CONFIG, search=replace(CONFIG.search, visited_starts=0.5, refine_fraction=0.5))
+    experiment = pg.compose(config, TASK)
+    state = experiment.init(key())
+    posterior = experiment.dynamics.posterior(state.model.params, state.data)
+    pieces: dict[str, Any] = dict(dynamics=experiment.dynamics, policy=experiment.policy)
+    own = pg.blocks(**pieces, start=lambda key: X, particles=K, horizon=H)
+    assert pg.draw(key(), 0, posterior, blocks=own).start.shape == (K, D)
+    again = pg.compose(config, TASK, dynamics=experiment.dynamics)
+    jax.eval_shape(again.improve, again.add_episode(state, again.collect(state)))
+
+
+@pytest.mark.parametrize("length", [-1, H + 1, 2.5])
+def test_an_episode_of_a_length_that_cannot_be_is_refused(length: float) -> None:
+    experiment = pg.compose(CONFIG, TASK)
+    state = experiment.init(key())
+    ran = experiment.collect(state)
+    with pytest.raises(ValueError, match=f"an episode's length is {length}; expected a whole number from 0 to"):
+        experiment.add_episode(state, ran._replace(length=np.asarray(length)))
+    whole = jax.jit(experiment.add_episode)(state, ran._replace(length=jnp.int32(1000)))
+    assert whole.data.size == len(ran.u)
+
+
+def test_an_episode_of_numpy_arrays_is_one() -> None:
+    experiment = pg.compose(CONFIG, TASK)
+    state = experiment.init(key())
+    ran = experiment.collect(state)
+    given = ran._replace(**{name: np.asarray(getattr(ran, name)) for name in ("x", "u", "cost")})
+    one, other = (experiment.add_episode(state, rows).data for rows in (given, ran))
+    assert jax.tree.all(jax.tree.map(np.array_equal, one, other))

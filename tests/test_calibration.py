@@ -85,3 +85,13 @@ def test_of_an_experiment_it_is_unknown_before_there_are_data_and_changes_nothin
     assert np.isfinite(calibrate(after, flown))
     assert same(flown, collect(after))
     assert calibrate(after, flown) == calibrate(after, flown)
+
+
+@pytest.mark.parametrize("length", [None, STEPS, 6])
+def test_a_model_that_predicts_nan_is_not_calibrated(length):
+    """Rows after an episode's end do not count; a NaN of the model is no such row."""
+    model = uncertain(0.0, 0.5)
+    broken = model._replace(apply=lambda *given: Prediction(model.apply(*given).mean.at[0].set(jnp.nan), jnp.ones(2)))
+    ran = episode(0.5)._replace(length=None if length is None else jnp.int32(length))
+    assert np.isnan(found(broken, ran))
+    assert np.isfinite(found(model, ran._replace(x=ran.x.at[7 if length == 6 else STEPS + 1].set(jnp.nan))))

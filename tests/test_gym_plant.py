@@ -388,3 +388,29 @@ def test_bad_input_is_one_clear_line(words: list[str], message: str, tmp_path: P
     done = train(*words, cwd=tmp_path)
     assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
     assert message in done.stderr
+
+
+def test_limits_that_are_the_environments_own_are_typed_in_double_precision() -> None:
+    """A box has them in single precision: 0.7 is less there."""
+
+    class Narrow(Base):
+        action_space = gymnasium.spaces.Box(-0.7, 0.7, (1,))
+
+    gymnasium.register("Narrow-v0", Narrow)
+    spec = env_spec("Narrow-v0", control_low=[-0.7], control_high=[0.7], dt=0.1)
+    np.testing.assert_allclose(spec.control_high, [0.7])
+    with pytest.raises(ValueError, match=r"controls from -0\.7 to 0\.71 are not among its own"):
+        env_spec("Narrow-v0", control_low=[-0.7], control_high=[0.71], dt=0.1)
+
+
+@pytest.mark.parametrize("flags", [(np.array([False, False]), False), (False, np.zeros(1))])
+def test_an_end_that_is_no_truth_is_named(flags: tuple) -> None:
+    class Vague(Base):
+        def step(self, action: Any) -> Any:
+            return np.zeros(1), 0.0, *flags, {}
+
+    gymnasium.register("Vague-v0", Vague)
+    ran = episode.drive(0, lambda t, x: np.ones(1), task_of("Vague-v0", 1))
+    close_environments()
+    assert "its step returned terminated=" in str(ran.error)
+    assert "expected True or False" in str(ran.error)

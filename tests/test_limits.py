@@ -46,9 +46,16 @@ def path(*positions: float) -> np.ndarray:
 
 
 def test_the_probability_is_the_share_of_trajectories_that_leave_the_limits():
-    """Once or often, on either side; one that begins outside says nothing of its policy."""
+    """Once or often, on either side; one that begins outside says nothing of its policy, and does not count."""
     paths = [path(0, 0.9, 0), path(0, 1.1, 0), path(0, -1.1, -2), path(1.2, 1.3, 0), path(0, 1.0, 0)]
-    assert limits.probability(jnp.concatenate(paths, 1), RAIL) == pytest.approx(2 / 5)
+    assert limits.probability(jnp.concatenate(paths, 1), RAIL) == pytest.approx(2 / 4)
+    assert limits.probability(path(1.2, 0, 0), RAIL) == 0
+
+
+def test_a_constraint_of_one_number_is_that_of_a_vector_of_one():
+    alone, paths = RAIL._replace(of_state=lambda x: jnp.abs(x[0]) - 1), path(0, 0.9, 1.3)
+    for function in (limits.probability, limits.penalty):
+        assert function(paths, alone) == function(paths, alone._replace(of_state=lambda x: jnp.abs(x[:1]) - 1))
 
 
 def test_the_penalty_is_flat_within_and_has_a_gradient_everywhere_beyond():

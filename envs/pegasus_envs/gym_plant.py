@@ -136,7 +136,8 @@ def env_spec(
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError(f"its controls have no limits: {controls}; give control_low= and control_high=")
     for least, greatest, bottom, top in zip(low, high, controls.low, controls.high, strict=True):
-        if not bottom <= least < greatest <= top:
+        # A box has limits in single precision, and a number that is typed has not.
+        if not np.float32(bottom) <= np.float32(least) < np.float32(greatest) <= np.float32(top):
             raise ValueError(
                 f"controls from {least:g} to {greatest:g} are not among its own, from {bottom:g} to {top:g}"
             )
@@ -224,6 +225,10 @@ def env_plant(name: str, arguments: tuple[str, ...], states: int, names: tuple[s
                 f"its step returned {_shape(answer)}; expected (observation, reward, terminated, truncated, info)"
             )
         seen, _, terminated, truncated, _ = answer
+        if not all(np.ndim(flag) == 0 for flag in (terminated, truncated)):
+            raise ValueError(
+                f"its step returned terminated={terminated}, truncated={truncated}; expected True or False"
+            )
         return observed(seen, states, names), sent, "terminated" if terminated else "truncated" if truncated else ""
 
     return EnvPlant(reset, step, lambda: close_env(name, arguments))

@@ -172,6 +172,9 @@ def experiment(
         Raises ValueError for arrays of other shapes, and, outside of jit, for numbers that are not finite and where
         there is no room left.
         """
+        trajectory = trajectory._replace(
+            **{name: jnp.asarray(getattr(trajectory, name)) for name in ("x", "u", "cost")}
+        )
         check_episode(state, trajectory, controls)
         ran, m = as_modeled(trajectory)
         data = dataset.add(state.data, ran, task.angles, m)
@@ -321,6 +324,8 @@ def check_episode(state: RunState, trajectory: Trajectory, controls: int) -> Non
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state.data.size, trajectory))):
         return
     length = horizon if trajectory.length is None else int(trajectory.length)
+    if not 0 <= length <= horizon or length != (trajectory.length if trajectory.length is not None else length):
+        raise ValueError(f"an episode's length is {trajectory.length}; expected a whole number from 0 to {horizon}")
     for name, rows in (("x", trajectory.x[: length + 1]), ("u", trajectory.u[:length])):
         for t, i in np.argwhere(~np.isfinite(np.asarray(rows)))[:1]:
             raise ValueError(f"an episode's {name}[{t}, {i}] is {rows[t, i]}; expected finite numbers")

@@ -77,6 +77,9 @@ def checked(task: Task) -> Task:
             raise ConfigError(
                 f"the task's {name} has shape {np.shape(getattr(task, name))}; expected ({size},), of {of}"
             )
+        given: Any = getattr(task, name)
+        if not isinstance(given, Tracer) and not np.isfinite(np.asarray(given, float)).all():
+            raise ConfigError(f"the task's {name} is {given}; expected finite numbers")
     if not isinstance(task.horizon, int | np.integer) or task.horizon < 1:
         raise ConfigError(f"the task's horizon={task.horizon!r} is not a whole number of control periods, at least 1")
     if not isinstance(task.dt, Tracer) and not 0 < task.dt < np.inf:

@@ -24,13 +24,18 @@ GROSS = 1.0  # as far beyond the limit as the start is before it: no more is ask
 class Constraint(NamedTuple):
     """What a policy is to keep to: a state breaks it where one of these numbers is positive."""
 
-    of_state: Callable[[Array], Array]  # x [D] -> [C]; about -1 where episodes start, 0 at the limit
+    of_state: Callable[[Array], Array]  # x [D] -> [C] or one number; about -1 where episodes start, 0 at the limit
     bound: float = 0.05  # on the probability that an episode breaks it
 
 
 def margin(x: Array, constraint: Constraint) -> Array:
     """The largest of the constraint's numbers for each of the states x [..., D] -> [...]; positive breaks it."""
-    return jnp.max(jnp.vectorize(constraint.of_state, signature="(d)->(c)")(x), -1)
+    return jnp.max(jnp.vectorize(_numbers(constraint), signature="(d)->(c)")(x), -1)
+
+
+def _numbers(constraint: Constraint) -> Callable[[Array], Array]:
+    """The constraint's numbers [C] of a state, of which it may return one alone."""
+    return lambda x: jnp.atleast_1d(constraint.of_state(x))
 
 
 def probability(x: Array, constraint: Constraint) -> Array:
@@ -39,7 +44,7 @@ def probability(x: Array, constraint: Constraint) -> Array:
     One that begins beyond the limit says nothing of its policy, and does not count.
     """
     over = margin(x, constraint) > 0
-    return jnp.mean(jnp.any(over[1:], 0) & ~over[0])
+    return jnp.sum(jnp.any(over[1:], 0) & ~over[0]) / jnp.maximum(jnp.sum(~over[0]), 1)
 
 
 def penalty(x: Array, constraint: Constraint) -> Array:
@@ -48,7 +53,7 @@ def penalty(x: Array, constraint: Constraint) -> Array:
     It is small before the limit, grows at it, and beyond it as a logarithm: particles that are far beyond still have a
     gradient, and do not drown the others.
     """
-    numbers = jax.vmap(jax.vmap(constraint.of_state))(x)
+    numbers = jax.vmap(jax.vmap(_numbers(constraint)))(x)
     return jnp.mean(jnp.sum(jnp.log1p(jax.nn.softplus(numbers / WIDTH)), -1))
 
 

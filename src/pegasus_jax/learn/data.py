@@ -29,7 +29,7 @@ def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...], memory: 
     is there stays: the caller sizes a data set for the whole run (trials x horizon).
     """
     horizon, capacity = trajectory.u.shape[0], data.x.shape[0]
-    length = horizon if trajectory.length is None else trajectory.length
+    length = horizon if trajectory.length is None else jnp.clip(trajectory.length, 0, horizon)
     rows = jnp.arange(horizon)
     place = jnp.where(rows < length, data.size + rows, capacity)  # beyond the end: dropped
     y = difference(trajectory.x[1:], trajectory.x[:-1], angles)

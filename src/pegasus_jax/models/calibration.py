@@ -26,15 +26,11 @@ def calibration(
     the median, because a few steps outside the data would decide a mean.
     """
     error, variance = one_step_errors(key, posterior, trajectory, dynamics=dynamics, angles=angles, draws=draws)
-    if trajectory.length is None:
-        return overconfidence(error, variance)
-    took_place = (jnp.arange(error.shape[0]) < trajectory.length)[:, None]
-    return jnp.sqrt(jnp.nanmedian(jnp.where(took_place, error**2 / variance, jnp.nan))) / HALF
-
-
-def overconfidence(error: Array, variance: Array) -> Array:
-    """`calibration` of errors and the variances [...] predicted for them."""
-    return jnp.sqrt(jnp.median(error**2 / variance)) / HALF
+    rows = jnp.arange(len(error))[:, None]
+    took_place = rows < (len(error) if trajectory.length is None else trajectory.length)
+    ratio = error**2 / variance
+    known = ~jnp.any(jnp.isnan(ratio) & took_place)  # else the model predicts NaN, which is no row that is left out
+    return jnp.sqrt(jnp.nanmedian(jnp.where(took_place & known, ratio, jnp.nan))) / HALF
 
 
 def one_step_errors(

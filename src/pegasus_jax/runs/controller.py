@@ -1,8 +1,10 @@
 """What a run has learned as a plain function, to be called by the program that drives the robot."""
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -56,10 +58,11 @@ class Controller:
             self._start = jax.jit(start).lower(x).compile()
             self._act = jax.jit(act).lower(self._params, jax.eval_shape(start, x), x, given).compile()
             self._given = given = np.zeros(given.shape, self._type)
+            self._reference: Any = None
             if task.reference is not None:
                 at = times(task)
                 values = np.asarray(jax.vmap(task.reference.value)(jnp.asarray(at)))
-                self.reference = lambda t: [np.interp(t, at, column) for column in values.T]
+                self._reference = lambda t: [np.interp(t, at, column) for column in values.T]
         self._goal: np.ndarray | None = None
         self.reset()
 
@@ -74,6 +77,17 @@ class Controller:
             raise ValueError("this policy was learned for one cost and has no goal to be set")
         self._goal = _numbers(goal, self._goals, "a goal", self._type)
 
+    @property
+    def reference(self) -> Any:
+        """What the episode follows: numbers [R], or a function of the time since `reset` [s]; None: nothing."""
+        return self._reference
+
+    @reference.setter
+    def reference(self, reference: ArrayLike | Callable[[float], ArrayLike]) -> None:
+        if not self._references:
+            raise ValueError("this policy was learned without a reference, and has none to be set")
+        self._reference = reference
+
     def _asked(self) -> np.ndarray:
         """The goal, then the reference of now and soon after."""
         if self._goals and self._goal is None:
@@ -85,7 +99,7 @@ class Controller:
         return self._given
 
     def _reference_at(self, t: float) -> np.ndarray:
-        value = self.reference(t) if callable(self.reference) else self.reference
+        value: Any = self._reference(t) if callable(self._reference) else self._reference
         return _numbers(value, self._references, "a reference", self._type)
 
     def __call__(self, x: ArrayLike) -> np.ndarray:
