@@ -62,25 +62,29 @@ def judged(run: Path) -> list[dict[str, Any]]:
     from pegasus_jax import controller
 
     env, rows, horizon = gymnasium.make(ENV, disable_env_checker=True), [], store.task_of(run).horizon
+    measured = list(config_io.load(run / "config.yaml").sensors.measured) or slice(None)
     told = ("trial", "plant_seconds", "policy", "ended", "episode_cost", "objective_fresh")
     told += ("constraint_expected", "constraint_broken", "constraint_rows", "calibration")
     for row in store.trials(run):
         rows.append({name: row[name] for name in told} | {"success": None, "hits": None})
         if row["trial"] in checkpoint.available(run) and row["constraint_expected"] is not None:
             control = controller(run, trial=row["trial"])
-            went = [flown(control, env, FIRST_RESET + number, horizon) for number in range(EPISODES)]
+            went = [flown(control, env, FIRST_RESET + number, horizon, measured) for number in range(EPISODES)]
             success, hits = np.mean(went, 0)
             rows[-1] |= {"success": float(success), "hits": float(hits)}
     return rows
 
 
-def flown(control: Any, env: Any, seed: int, horizon: int) -> tuple[bool, bool]:
-    """Whether an episode of so many periods ends upright and stays there, and whether it hits the stop."""
+def flown(control: Any, env: Any, seed: int, horizon: int, measured: list[int] | slice) -> tuple[bool, bool]:
+    """Whether an episode of so many periods ends upright and stays there, and whether it hits the stop.
+
+    `measured` are the entries of an observation that the controller is given.
+    """
     x, _ = env.reset(seed=seed)
     control.reset()
     off, hit = [], False
     while len(off) < horizon and not hit:
-        x, _, hit, _, _ = env.step(np.asarray(control(x), np.float32))
+        x, _, hit, _, _ = env.step(np.asarray(control(x[measured]), np.float32))
         off.append(abs((x[1] % (2 * np.pi)) - np.pi))
     return not hit and max(off[-HELD:]) < UPRIGHT, bool(hit)
 
