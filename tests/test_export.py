@@ -18,7 +18,7 @@ from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli import export as cli
 from pegasus_jax.config import KINDS
-from pegasus_jax.exports import as_c, write
+from pegasus_jax.exports import as_c, parity, write
 from pegasus_jax.exports.learned import Learned, said
 from pegasus_jax.exports.parity import observations
 from pegasus_jax.math.circles import to_observation
@@ -89,7 +89,7 @@ def test_a_file_is_the_policy(runs: dict[str, Path], name: str, format: str, tmp
     file = pegasus_jax.export(run, trial=2, format=format, out=tmp_path / f"act{suffix}")
     x = fresh(run)
     expected = np.stack([control(row) for row in x])
-    found = write.FORMATS[format].run(file, x.astype(expected.dtype))
+    found = write.FORMATS[format].run(file, x.astype(expected.dtype), parity.EPISODE)
     assert found.dtype == expected.dtype
     span = np.asarray(store.task_of(run).control_high) - np.asarray(store.task_of(run).control_low)
     single = 2e-5 if name.startswith("rbf") else 2e-6
@@ -157,7 +157,10 @@ def test_a_file_that_is_not_the_policy_is_not_kept(
 def test_controls_that_are_no_numbers_or_too_many_are_not_kept(
     runs: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    for run, complaint in ((lambda _, x: np.full((len(x), 1), np.nan), "by nan"), (lambda _, x: x, r"controls \[1000")):
+    for run, complaint in (
+        (lambda _, x, n: np.full((len(x), 1), np.nan), "by nan"),
+        (lambda _, x, n: x, r"controls \[1000"),
+    ):
         monkeypatch.setitem(write.FORMATS, "numpy", write.FORMATS["numpy"]._replace(run=run))
         with pytest.raises(RunError, match=complaint):
             pegasus_jax.export(runs["mlp"], out=tmp_path / "act.py")
@@ -174,7 +177,7 @@ def test_a_policy_of_another_kind_is_stablehlo_only(runs: dict[str, Path], tmp_p
             write.FORMATS[format].write(learned, "act")
     (file := tmp_path / "act").write_bytes(write.FORMATS["stablehlo"].write(learned._replace(config=config), "act"))
     x = np.float32([[0.5, 0, 0, 0]])
-    np.testing.assert_allclose(write.FORMATS["stablehlo"].run(file, x), [[3 * np.cos(0.5)]], rtol=1e-6)
+    np.testing.assert_allclose(write.FORMATS["stablehlo"].run(file, x, parity.EPISODE), [[3 * np.cos(0.5)]], rtol=1e-6)
 
 
 # What a user does wrong

@@ -273,3 +273,10 @@ def whole(name: str, text: str) -> int:
     least = 1 if name in ("episodes", "seeds", "jobs") else 0
     check_range(name, int(text), least, 2**32 - 1 if name == "seed" else SIZES["trials"])
     return int(text)
+
+
+def true(name: str, text: str) -> bool:
+    """Whether an option is true. Raises ConfigError for one that is not false either."""
+    if text not in ("true", "false"):
+        raise ConfigError(f"{name}={text} is neither true nor false")
+    return text == "true"

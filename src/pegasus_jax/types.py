@@ -1,8 +1,8 @@
 """The vocabulary: every value that passes between the pieces, and the signature of every piece.
 
-Index letters, everywhere: K particles, H horizon, D state, U control, F encoded features, N dataset capacity,
-M minibatch, T trials, S seeds, E episodes. A piece that draws takes a `key`; a piece that takes noise is deterministic;
-none does both. A variant of a piece is another value of its type, never a subclass.
+Index letters, where nothing else is said: K particles, H horizon, D state, U control, F encoded features, N dataset
+capacity, M minibatch, T trials, S seeds, E episodes. A piece that draws takes a `key`; a piece that takes noise is
+deterministic; none does both. A variant of a piece is another value of its type, never a subclass.
 """
 
 from collections.abc import Callable
@@ -20,7 +20,7 @@ class Dataset(NamedTuple):
 
     x: Array  # [N, D] observed state
     u: Array  # [N, V] control as the model is given it; V = U unless the task's memory or hindsight says otherwise
-    y: Array  # [N, D] change of state; differences of angles are wrapped to (-pi, pi]
+    y: Array  # [N, D] change of state; differences of angles are wrapped to [-pi, pi]
     size: Array  # [] int32, rows in use; the rows beyond are zero
     memory: Array | None = None  # [N, M] what was remembered there; None: the task has no memory
 
@@ -29,7 +29,7 @@ class Batch(NamedTuple):
     """Rows of a dataset."""
 
     x: Array  # [M, D]
-    u: Array  # [M, U]
+    u: Array  # [M, V]
     y: Array  # [M, D]
 
 
@@ -181,8 +181,9 @@ class PolicyOptimizer(NamedTuple):
 
     init: Callable[[Params], Any]  # parameters -> the optimizer's state
     # (key, learner, posterior, steps=, first=, earlier=, fresh=) -> (learner, SearchInfo): iterations first .. first +
-    # steps - 1 of the search after `earlier` others; `fresh` are those of some that know nothing [2, ...],
-    # with policies side by side of more. One that refines also takes works=, whether the newest episode succeeded
+    # steps - 1 of the search after `earlier` others; `fresh` are those of some that know nothing [2, ...], with
+    # policies side by side of more. One that refines also takes works=, whether the given policy succeeded in the
+    # newest episode
     run: Callable[..., tuple[TrainState, Any]]
 
 

@@ -4,7 +4,7 @@ import json
 import sys
 from collections.abc import Sequence
 
-from pegasus_jax.checks import ConfigError
+from pegasus_jax.checks import true
 from pegasus_jax.cli.main import main
 from pegasus_jax.cli.runs import run_and, trial_of
 from pegasus_jax.cli.words import OF_RUN
@@ -38,8 +38,7 @@ def export() -> None:
 def handle(words: Sequence[str]) -> None:
     """Export a policy, and say how close the file is to it. Raises ConfigError for words that cannot be."""
     run, rest = run_and(words, OF_RUN["pegasus-export"])
-    if rest["overwrite"] not in ("true", "false"):
-        raise ConfigError(f"overwrite={rest['overwrite']} is neither true nor false")
+    overwrite = true("overwrite", rest["overwrite"])
     trial = trial_of(rest["trial"])
     # At once: to import JAX and to compile the policy takes a while. Standard output is for what was written.
     told = f"exporting {run}, and comparing the file with its policy on 1,000 observations"
@@ -47,7 +46,7 @@ def handle(words: Sequence[str]) -> None:
     from pegasus_jax.exports import write
     from pegasus_jax.runs.restore import chosen
 
-    file = write.export(run, trial, rest["format"], rest["out"] or None, rest["overwrite"] == "true")
+    file = write.export(run, trial, rest["format"], rest["out"] or None, overwrite)
     contract = json.loads(write.contract_of(file).read_bytes())
     parity = contract["parity"]
     print(f"{file}: {contract['title']}")

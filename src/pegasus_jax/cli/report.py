@@ -5,7 +5,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pegasus_jax.checks import ConfigError
+from pegasus_jax.checks import ConfigError, true
 from pegasus_jax.cli.main import main
 from pegasus_jax.cli.runs import paths_and
 from pegasus_jax.cli.words import OF_RUN
@@ -38,12 +38,11 @@ def report() -> None:
 def handle(words: Sequence[str]) -> None:
     """Write the report of the runs named. Raises ConfigError for words that cannot be."""
     paths, options = paths_and(words, OF_RUN["pegasus-report"])
-    if options["film"] not in ("true", "false"):
-        raise ConfigError(f"film={options['film']} is neither true nor false")
+    filmed = true("film", options["film"])
     from pegasus_jax.runs import groups
 
     runs = groups.found(paths)
-    if options["film"] == "true":
+    if filmed:
         if len(runs) > 1:
             raise ConfigError(f"film=true is for one run, not {len(runs)}; for example {runs[0]}")
         from pegasus_jax.viz.video import film

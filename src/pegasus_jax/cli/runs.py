@@ -5,21 +5,20 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from pegasus_jax.checks import ConfigError, whole
+from pegasus_jax.checks import ConfigError, true, whole
 from pegasus_jax.cli.words import OF_RUN
 
 
 def evaluate(words: Sequence[str]) -> None:
     run, rest = run_and(words, OF_RUN["pegasus-eval"])
     episodes, seed = (whole(name, rest[name]) for name in ("episodes", "seed"))
-    if rest["json"] not in ("true", "false"):
-        raise ConfigError(f"json={rest['json']} is neither true nor false")
+    as_json = true("json", rest["json"])
     from pegasus_jax.runs.evaluation import evaluate_run
     from pegasus_jax.runs.restore import chosen
 
     trial = trial_of(rest["trial"])
     result = evaluate_run(run, episodes, seed, trial, rest["mjcf"] or None)
-    if rest["json"] == "true":
+    if as_json:
         print(json.dumps(result))
     else:
         print(chosen(run, trial, result["trial"]))

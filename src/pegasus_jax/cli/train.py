@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pegasus_jax import start
-from pegasus_jax.checks import ConfigError, whole
+from pegasus_jax.checks import ConfigError, true, whole
 from pegasus_jax.cli.words import NEW
 from pegasus_jax.cli.words import OPTIONS as WORDS
 from pegasus_jax.config import Search
@@ -53,11 +53,10 @@ def new(options: Mapping[str, str], settings: Mapping[str, str], known: Sequence
 
 def _settled(asked: Asked, options: Mapping[str, str]) -> Asked:
     """What is asked for, with the options of any run. Raises ConfigError for what they cannot be; opens no device."""
-    if options.get("final", "false") not in ("true", "false"):
-        raise ConfigError(f"final={options['final']} is neither true nor false")
+    final = true("final", options.get("final", "false"))
     if "mesh" in options:
         _shape(options["mesh"], len(asked.runs))
-    return asked._replace(final=options.get("final") == "true", track=trackers.asked(options.get("track")))
+    return asked._replace(final=final, track=trackers.asked(options.get("track")))
 
 
 def _configured(asked: Asked, options: dict[str, str]) -> Any:
@@ -89,12 +88,10 @@ def _join(options: dict[str, str]) -> None:
     import jax
 
     given = {name for name in ("coordinator", "processes", "process") if name in options}
-    if not given and options.get("distributed", "false") == "false":
+    if not (true("distributed", options.get("distributed", "false")) or given):
         return
     if given and len(given) < 3:
         raise ConfigError("coordinator=HOST:PORT, processes=N and process=I (from 0) go together")
-    if options.get("distributed", "true") != "true":
-        raise ConfigError(f"distributed={options['distributed']} is neither true nor false")
     try:
         if given:
             count, index = (whole(name, options[name]) for name in ("processes", "process"))

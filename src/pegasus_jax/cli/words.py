@@ -11,6 +11,7 @@ from pegasus_jax import config as limits
 from pegasus_jax.config import KINDS, TASKS, Config
 from pegasus_jax.config_models import ACTIVATIONS, DROPOUTS, INITIALIZERS
 from pegasus_jax.config_plant import EXPLORATIONS, VELOCITIES
+from pegasus_jax.config_policies import SQUASHES
 from pegasus_jax.presets import ALGORITHMS, EFFORTS, MODELS, NETWORKS, POLICIES, PRESETS
 
 # Words of pegasus-train that are no settings: as help shows them, and what they are for.
@@ -112,7 +113,7 @@ VALUES: dict[str, tuple[Any, ...]] = {
     "model.activation": ACTIVATIONS,
     "model.initializer": INITIALIZERS,
     "policy.initializer": INITIALIZERS,
-    "policy.squash": ("tanh", "sine"),
+    "policy.squash": SQUASHES,
     "search.matching": limits.MATCHINGS,
     "search.cost_estimator": limits.COST_ESTIMATORS,
     "search.observation_noise": limits.OBSERVATION_NOISES,

@@ -250,7 +250,7 @@ def compiler() -> list[str]:
     return found
 
 
-def run(path: Path, observations: np.ndarray, episode: int = 20) -> np.ndarray:
+def run(path: Path, observations: np.ndarray, episode: int) -> np.ndarray:
     """What the header at `path` does for observations [N, O], of so many an episode, compiled here: controls [N, U]."""
     name, text = path.stem, path.read_text(encoding="utf-8")
     controls = int(re.search(rf"define {name.upper()}_CONTROLS (\d+)", text)[1])  # type: ignore[index]

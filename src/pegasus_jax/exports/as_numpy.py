@@ -185,7 +185,7 @@ def _stored(name: str, array: np.ndarray) -> str:
     )
 
 
-def run(path: Path, observations: np.ndarray, episode: int = 20) -> np.ndarray:
+def run(path: Path, observations: np.ndarray, episode: int) -> np.ndarray:
     """What the module at `path` does for observations [N, O], of so many an episode: controls [N, U]."""
     control, found = runpy.run_path(str(path))["Controller"](), []
     for number, x in enumerate(observations):

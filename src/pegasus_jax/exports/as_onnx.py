@@ -196,7 +196,7 @@ def _waves(graph: Graph, x: str, pair: tuple[int, ...], dtype: np.dtype) -> dict
     return {"sine": node("Div", sined, length), "cosine": node("Div", cosine, length)}
 
 
-def run(path: Path, observations: np.ndarray, episode: int = 20) -> np.ndarray:
+def run(path: Path, observations: np.ndarray, episode: int) -> np.ndarray:
     """What onnxruntime makes of the file at `path` for observations [N, O], of so many an episode: controls [N, U]."""
     runtime = imported("onnxruntime")
     session = runtime.InferenceSession(path.read_bytes(), providers=["CPUExecutionProvider"])

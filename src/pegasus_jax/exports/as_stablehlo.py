@@ -26,7 +26,7 @@ def write(learned: Learned, name: str) -> bytes:
         return bytes(jax_export.export(jax.jit(function), platforms=PLATFORMS)(*shapes).serialize())
 
 
-def run(path: Path, observations: np.ndarray, episode: int = 20) -> np.ndarray:
+def run(path: Path, observations: np.ndarray, episode: int) -> np.ndarray:
     """What the file at `path` does for observations [N, O], of so many an episode: controls [N, U]."""
     with jax.enable_x64(observations.dtype == np.float64):
         exported = jax_export.deserialize(bytearray(path.read_bytes()))

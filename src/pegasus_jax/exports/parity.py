@@ -60,15 +60,15 @@ def observations(run: Path, task: Task) -> tuple[np.ndarray, int]:
     return np.concatenate([given, sizes * draw.uniform(-2, 2, (len(given), len(sizes)))], 1), len(stored)
 
 
-def compared(run: Callable[[np.ndarray], np.ndarray], learned: Learned, folder: Path) -> Parity:
+def compared(run: Callable[[np.ndarray, int], np.ndarray], learned: Learned, folder: Path) -> Parity:
     """What `run`, the file, makes of observations [N, O] of the run in `folder`, beside what the policy does.
 
-    One that remembers is reset every 20 observations. Raises RunError where the difference is more than is allowed.
+    One that remembers is reset every `EPISODE` observations. Raises RunError where the difference is more than allowed.
     """
     task = learned.task
     given, stored = observations(folder, task)
     given = given.astype(learned.dtype)
-    found, shape = run(given), (len(given), len(task.control_names))
+    found, shape = run(given, EPISODE), (len(given), len(task.control_names))
     if found.shape != shape:
         raise RunError(f"the file returns controls {[*found.shape]}, the policy {[*shape]}; it was not kept")
     with precision(learned.config):

@@ -26,7 +26,8 @@ class Format(NamedTuple):
 
     suffix: str
     write: Callable[[Learned, str], bytes]  # (policy, a name for what is inside) -> the file
-    run: Callable[[Path, np.ndarray], np.ndarray]  # (file, observations [N, O]) -> controls [N, U]
+    # (file, observations [N, O], how many of them an episode has) -> controls [N, U]
+    run: Callable[[Path, np.ndarray, int], np.ndarray]
 
 
 FORMATS = {

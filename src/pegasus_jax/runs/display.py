@@ -57,6 +57,7 @@ class Display:
         self.trials = trials
         self.asks = False  # whether an episode may speak with a person, as a robot's reset does: the table makes room
         self.done: list[Sequence[dict[str, Any]]] = []  # the rows of each finished trial, one a seed
+        self.first = 1  # the trial of the first policy that is kept: 0 where one is before the first episode
         self.what, self.stage, self.since = "preparing", "preparing", time.monotonic()
         self.said, self.spoke = "", self.since  # the last line of a log, and when
         self.clock = Clock()
@@ -115,7 +116,7 @@ class Display:
         """A trial is done, with these rows, one a seed: a row of the table, or a line of a log."""
         self.done.append(rows)
         if not self.console.is_terminal:
-            number = best(self.done) if len(rows) == 1 else None
+            number = best(self.done, self.first) if len(rows) == 1 else None
             self.line(summary(rows, self.trials, number))
         elif note := "  ".join(filter(None, (limits(rows), skipped(rows)))):
             self.line(f"trial {rows[0]['trial']}: {note}")
@@ -152,7 +153,7 @@ class Display:
             room = max(self.console.height - AROUND, 3)
             parts += [table(done[-room:], self.trials, max(len(done) - room, 0))]
             parts += [curves(done, BLOCKS if "utf" in self.console.encoding.lower() else PLAIN)]
-            number = best(done) if len(done[0]) == 1 else None
+            number = best(done, self.first) if len(done[0]) == 1 else None
             of_one = (
                 "" if number is None else best_line([rows[0] for rows in done], number).replace("policy", "so far", 1)
             )

@@ -124,8 +124,10 @@ def learn(job: Job, states: RunState, done: int | None = None) -> RunState:
     if done is None and first_search(job.config) == 0 and not job.logs.rows:
         states, found = improved(job, states, 0)
         job.display.line(f"before the first episode  {learned([UNMEASURED | row for row in found])}")
-    if done is None and (first_search(job.config) == 0 or begins_with(job.config, "policy")):
-        job.writer.ready(states)
+    if first_search(job.config) == 0 or begins_with(job.config, "policy"):
+        job.display.first = 0
+        if done is None:
+            job.writer.ready(states)
     before: list[Row] = []
     changed = [{"cost_since": since} if since > 1 else {} for since in job.cost_since or [1] * len(job.seeds)]
 

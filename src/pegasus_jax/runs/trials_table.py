@@ -64,10 +64,13 @@ def spark(values: Sequence[Any], blocks: str = BLOCKS) -> str:
     )
 
 
-def best(trials: Sequence[Rows]) -> int | None:
-    """The trial with the best policy of a single seed so far; None where rows of an earlier version do not tell."""
+def best(trials: Sequence[Rows], first: int) -> int | None:
+    """The trial with the best policy of a single seed so far, `first` as in `store.best_trial`.
+
+    None where rows of an earlier version do not tell.
+    """
     try:
-        return store.best_trial([rows[0] for rows in trials], first=0)
+        return store.best_trial([rows[0] for rows in trials], first=first)
     except (KeyError, TypeError):
         return None
 
