@@ -95,3 +95,15 @@ def test_a_model_that_predicts_nan_is_not_calibrated(length):
     ran = episode(0.5)._replace(length=None if length is None else jnp.int32(length))
     assert np.isnan(found(broken, ran))
     assert np.isfinite(found(model, ran._replace(x=ran.x.at[7 if length == 6 else STEPS + 1].set(jnp.nan))))
+
+
+@pytest.mark.parametrize("length", [None, 6])
+def test_what_is_known_exactly_says_nothing(length):
+    """An entry that never changes, and of which a model without noise knows that, is 0 / 0."""
+    still = episode(0.5)._replace(length=None if length is None else jnp.int32(length))
+    still = still._replace(x=still.x.at[:, 0].set(1.0))
+    exact = known(PENDULUM)._replace(
+        sample=lambda key, posterior: jnp.zeros(STATES),
+        apply=lambda posterior, draw, x, u: Prediction(jnp.zeros(STATES), jnp.array([0.0, 0.5])),
+    )
+    assert 0.2 < found(exact, still) < 3

@@ -403,7 +403,7 @@ def test_limits_that_are_the_environments_own_are_typed_in_double_precision() ->
         env_spec("Narrow-v0", control_low=[-0.7], control_high=[0.71], dt=0.1)
 
 
-@pytest.mark.parametrize("flags", [(np.array([False, False]), False), (False, np.zeros(1))])
+@pytest.mark.parametrize("flags", [(np.array([False, False]), False), (False, np.zeros(2))])
 def test_an_end_that_is_no_truth_is_named(flags: tuple) -> None:
     class Vague(Base):
         def step(self, action: Any) -> Any:

@@ -349,8 +349,25 @@ def test_an_episode_column_may_be_written_in_capitals(header, tmp_path):
         ("x [m], first;v;u\n1.5;-2;0.25\n2.5;0.3;0\n", [[1.5, -2, 0.25]]),
         ("1.5,-2,0.25,\n2.5,0.3,0,\n", [[1.5, -2, 0.25]]),
         ("x,v,u,,\n1.5,-2,0.25,,\n2.5,0.3,0,,\n", [[1.5, -2, 0.25]]),
+        ("x,\tv,\tu\n1.5,\t-2,\t0.25\n2.5,\t0.3,\t0\n", [[1.5, -2, 0.25]]),
+        ("x,v,u,note (a; b)\n1.5,-2,0.25,0\n2.5,0.3,0,0\n", [[1.5, -2, 0.25]]),
+        ("x,v,u\t\n1.5,-2,0.25\n2.5,0.3,0\n", [[1.5, -2, 0.25]]),
+        ("x\tv\tu\n1.5\t-2\t0.25\n2.5\t0.3\t0\n", [[1.5, -2, 0.25]]),
     ],
 )
 def test_marks_between_cells_and_in_numbers(text, rows, tmp_path):
     (tmp_path / "a.csv").write_text(text)
     np.testing.assert_allclose(first(str(tmp_path / "a.csv"), CART)[0], rows, atol=1e-6)
+
+
+def test_the_numbers_of_an_arrays_columns_are_a_header(tmp_path):
+    """As pandas writes some of them: over those of its rows is an empty cell."""
+    (tmp_path / "a.csv").write_text(",2,3,4,5\n0,1.5,-2,0.25,9\n1,2.5,0.3,0,9\n")
+    np.testing.assert_allclose(first(str(tmp_path / "a.csv"), CART, ("2", "3", "4"))[0], [[1.5, -2, 0.25]])
+
+
+def test_a_column_of_labels_is_no_episode(tmp_path):
+    (tmp_path / "a.csv").write_text("x,v,u,Episode\n1,2,0.5,run a\n2,3,0.5,run a\n")
+    assert len(read([str(tmp_path / "a.csv")], CART)[0]) == 1
+    (tmp_path / "b.csv").write_text("x,v,u,Episode,episode\n1,2,0.5,1,1\n2,3,0.5,2,1\n2,3,0.5,3,1\n")
+    assert len(read([str(tmp_path / "b.csv")], CART)[0][0].trajectory.u) == 2

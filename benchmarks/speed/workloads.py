@@ -5,6 +5,7 @@ objective and its gradient say something.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -88,7 +89,7 @@ def workload(words: dict[str, str], horizon: int | None = None) -> Workload:
     config = config_io.parse(words)
     task = tasks.of_config(config)
     task = task._replace(cost=near(task), horizon=horizon or task.horizon)
-    experiment = compose(config, task)
+    experiment = compose(replace(config, horizon=None), task)
     state = jax.jit(experiment.init)(jax.random.key(config.seed))
     add_episode = jax.jit(experiment.add_episode)
     for seed in range(EPISODES):

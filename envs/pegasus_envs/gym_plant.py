@@ -136,8 +136,9 @@ def env_spec(
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError(f"its controls have no limits: {controls}; give control_low= and control_high=")
     for least, greatest, bottom, top in zip(low, high, controls.low, controls.high, strict=True):
-        # A box has limits in single precision, and a number that is typed has not.
-        if not np.float32(bottom) <= np.float32(least) < np.float32(greatest) <= np.float32(top):
+        # A box may have limits in single precision, and a number that is typed has not.
+        kind = controls.dtype.type if np.issubdtype(controls.dtype, np.floating) else float  # type: ignore[union-attr]
+        if not (bottom <= kind(least) and least < greatest and kind(greatest) <= top):
             raise ValueError(
                 f"controls from {least:g} to {greatest:g} are not among its own, from {bottom:g} to {top:g}"
             )
@@ -225,7 +226,7 @@ def env_plant(name: str, arguments: tuple[str, ...], states: int, names: tuple[s
                 f"its step returned {_shape(answer)}; expected (observation, reward, terminated, truncated, info)"
             )
         seen, _, terminated, truncated, _ = answer
-        if not all(np.ndim(flag) == 0 for flag in (terminated, truncated)):
+        if not all(np.size(flag) == 1 for flag in (terminated, truncated)):
             raise ValueError(
                 f"its step returned terminated={terminated}, truncated={truncated}; expected True or False"
             )

@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.sharding import Mesh
 
 from pegasus_jax import config as settings
@@ -73,12 +74,12 @@ def compose(
     """The experiment of a config on any task, with pieces of your own in place of the configured or the task's ones.
 
     A `cost` may be a function of one state x [D] and, by these names, of u, previous_u, t, reference, goal. A
-    `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as configured.
-    There is room for `logged` rows of data besides those of the trials. Controls of a policy of your own beyond the
-    task's limits are cut off at them, in imagination as on the plant. With a `mesh` (sharding.py) the particles of a
-    search are spread over its devices. Raises ConfigError for what is no piece, a task whose fields do not agree, a
-    setting that makes another task than the one given, and a piece that does not suit the config: moment matching, for
-    example, needs more particles than states.
+    `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as
+    configured. There is room for `logged` rows of data besides those of the trials. Controls of a policy of your
+    own beyond the task's limits are cut off at them, in imagination as on the plant. With a `mesh` (sharding.py)
+    the particles of a search are spread over its devices. Raises ConfigError for what is no piece, a task whose
+    fields do not agree, a horizon, dt, stop, constraint, prior, reference or goal of the config that the task has
+    not, and a piece that does not suit the config: moment matching, for example, needs more particles than states.
     """
     _of_kinds(config=config, task=task, dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher)
     _agree(config, task)
@@ -91,11 +92,16 @@ def _agree(config: settings.Config, task: Task) -> None:
     told: dict[str, Any] = {name: getattr(config, name) for name in ("stop", "constraint", "prior", "reference")}
     told["goal"] = config.goals or config.goal_low or None
     missing = [name for name, value in told.items() if value is not None and getattr(task, name) is None]
-    other = [name for name in ("horizon", "dt") if getattr(config, name) not in (None, getattr(task, name))]
+    own = {name: getattr(task, name) for name in ("horizon", "dt")}
+    other = [
+        name
+        for name, value in own.items()
+        if not isinstance(value, Tracer) and getattr(config, name) not in (None, value)
+    ]
     for name in [*missing, *other]:
         raise ConfigError(
             f"the Config has a {name}, and the task {task.name} has {shown(getattr(task, name))}, which is what counts:"
-            f" tasks.of_config(config) makes a task of a Config, task._replace({name}=...) changes one"
+            f" leave it out of the Config; task._replace({name}=...) changes it, tasks.of_config(config) makes a task"
         )
 
 

@@ -38,7 +38,7 @@ def gradient_search(
     The learner is policy parameters and `optimizer.init` of them. `optimizer` has the clip of lines 17 and 18 in it:
     optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-3)). Where the objective or its gradient is not finite, an
     update changes nothing. The information has an entry for each of the N steps, [N]. With `first` they go on with a
-    search of which so many are done; what else a trial tells its searcher is of no use here.
+    search of which so many are done. A trial also tells its searcher `earlier`, `fresh` and `works`: of no use here.
     """
 
     def step(carry: tuple[TrainState, Scenarios], i: Array) -> tuple[tuple[TrainState, Scenarios], SearchInfo]:

@@ -82,8 +82,9 @@ def layout(table: Table, names: Names, columns: Sequence[str], dt: float) -> tup
     taken = {column.name for column in said.values()} or {*own.values()}
     found = times.known(table.names, taken)
     time = said.get("t") or (found and Column(*found))
-    apart = (name for name in table.names if name.casefold() == EPISODE and name not in taken)
-    episode = said[EPISODE].name if EPISODE in said else next(apart, None)
+    labels = {table.names[column] for _, column in table.texts}  # in capitals it may be another thing
+    alike = [name for name in table.names if name.casefold() == EPISODE and name not in {*taken, *labels - {EPISODE}}]
+    episode = said[EPISODE].name if EPISODE in said else EPISODE if EPISODE in alike else next(iter(alike), None)
     called = {column: name for name, column in own.items()}
     other = [f"{c.name} is taken for {n}" for n, c in said.items() if called.get(c.name, n) != n]
     note = f"by {SETTING}=, {', and '.join(other)}" if other else ""

@@ -25,7 +25,7 @@ def of_csv(path: Path) -> Table:
     kept = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
     if not kept:
         raise ConfigError(f"{path} is empty; expected a header and rows of numbers")
-    comma = next((mark for mark in ";\t" if mark in kept[0][1]), ",")  # before a comma, which may be a decimal one
+    comma = _mark([line for _, line in kept])
     cells = [_cells(f"{path} line {number}", line, comma) for number, line in kept]
     while len({*map(len, cells)}) == 1 < len(cells[0]) and not any(row[-1] for row in cells):  # of a comma at its end
         cells = [row[:-1] for row in cells]
@@ -33,7 +33,7 @@ def of_csv(path: Path) -> Table:
         cells = [[_pointed(cell) for cell in row] for row in cells]
     remarks = [line for line in lines[: kept[0][0] - 1] if line[:1] == "#"]
     above = [cell.strip() for cell in remarks[-1].lstrip("#").split(comma)] if remarks else []
-    names, header = _header(cells[0], above)
+    names, header = _header(cells[0], above, cells[1] if len(cells) > 1 else cells[0])
     body, places = cells[header:], np.array([number for number, _ in kept][header:], int)
     if twice := [name for name in names if names.count(name) > 1]:
         raise ConfigError(f"{path} has two columns called {twice[0]!r}; expected names that differ")
@@ -58,11 +58,26 @@ def _cells(where: str, line: str, comma: str) -> list[str]:
     return [cell.strip() for cell in row]
 
 
-def _header(first: list[str], above: list[str]) -> tuple[tuple[str, ...], bool]:
+def _mark(lines: list[str]) -> str:
+    """What is between the cells of lines: a semicolon before a tab before a comma, which may be a decimal one.
+
+    The first by which lines have as many cells, more than one, and the last one numbers; else one of the first line.
+    """
+    for mark in ";\t,":
+        rows = [next(csv.reader([line], delimiter=mark), []) for line in (*lines[:2], lines[-1])]
+        last = [cell.strip() for cell in rows[-1]]
+        numbers = not any(cell and _number(_pointed(cell) if mark == ";" else cell) is None for cell in last)
+        if numbers and len(last) > 1 and {*map(len, rows)} == {len(last)}:
+            return mark
+    return next((mark for mark in ",;\t" if mark in lines[0]), ",")
+
+
+def _header(first: list[str], above: list[str], second: list[str]) -> tuple[tuple[str, ...], bool]:
     """The names of the columns, of the first row and the remark above it, and whether that row is them and no data."""
     numbered = [str(i) for i in range(len(first))]
-    # Pandas writes the numbers of an array's columns, behind an empty cell over those of its rows.
-    if any(cell and _number(cell) is None for cell in first) or (not first[0] and first[1:] == numbered[:-1]):
+    # Pandas writes the numbers of an array's columns behind an empty cell, which is over those of its rows.
+    of_array = not first[0] and bool(second[0]) and all(cell.isdecimal() for cell in first[1:])
+    if of_array or any(cell and _number(cell) is None for cell in first):
         return tuple(first), True
     if len(above) == len(first) and all(cell and _number(cell) is None for cell in above):
         return tuple(above), False

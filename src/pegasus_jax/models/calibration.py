@@ -29,7 +29,8 @@ def calibration(
     rows = jnp.arange(len(error))[:, None]
     took_place = rows < (len(error) if trajectory.length is None else trajectory.length)
     ratio = error**2 / variance
-    known = ~jnp.any(jnp.isnan(ratio) & took_place)  # else the model predicts NaN, which is no row that is left out
+    # Else the model predicts NaN, which is no row that is left out; nor is 0 / 0, of what is known exactly.
+    known = ~jnp.any((jnp.isnan(error) | jnp.isnan(variance)) & took_place)
     return jnp.sqrt(jnp.nanmedian(jnp.where(took_place & known, ratio, jnp.nan))) / HALF
 
 
