@@ -17,7 +17,7 @@ from pegasus_jax.assembly.experiments import build, compose
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config, Sensors
 from pegasus_jax.episode import run
-from pegasus_jax.exports import as_c, write
+from pegasus_jax.exports import as_c, parity, write
 from pegasus_jax.imagine import matching
 from pegasus_jax.imagine.rollout import rollout
 from pegasus_jax.learn.fit import FitInfo
@@ -274,7 +274,7 @@ def test_a_file_remembers_as_the_controller_does(sensor_run):
         file = write.export(run_of, 2, format)
         said = json.loads(write.contract_of(file).read_text())
         assert said["parity"]["largest_difference"] <= said["parity"]["allowed"] < 2e-5
-        found = write.FORMATS[format].run(file, rows.astype(expected.dtype))
+        found = write.FORMATS[format].run(file, rows.astype(expected.dtype), parity.EPISODE)
         # Of the policy that is told its own controls alone, roundings grow along an episode.
         np.testing.assert_allclose(found, expected, rtol=0, atol=0.02 if name == "late" else 2e-4)
         assert len(said["observation"]) == rows.shape[1]
