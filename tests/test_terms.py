@@ -369,7 +369,7 @@ def test_the_controller_is_given_goals_and_references(tmp_path):
     for format in ("numpy", "onnx", "stablehlo"):  # a file that is asked, and remembers nothing
         made = FORMATS[format]
         rows = np.stack([seen(t, sine) for t in (0.0, 0.2)])
-        found = made.run(export(run, "last", format, tmp_path / f"asked{made.suffix}"), rows)
+        found = made.run(export(run, "last", format, tmp_path / f"asked{made.suffix}"), rows, len(rows))
         np.testing.assert_allclose(found, [by_hand(t, sine) for t in (0.0, 0.2)], rtol=1e-4)
     control.reference = [0.3, 0.4]
     with pytest.raises(ValueError, match="a reference is 1 finite numbers"):
