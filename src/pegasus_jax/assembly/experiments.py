@@ -51,7 +51,7 @@ def build(config: settings.Config, mesh: Mesh | None = None, logged: int = 0) ->
 
 @lru_cache(maxsize=64)
 def _built(config: settings.Config, mesh: Mesh | None, logged: int) -> Experiment:
-    return assembled(config, _posed(config), mesh=mesh, logged=logged)
+    return assembled(config, _posed(config), mesh, logged)
 
 
 @lru_cache(maxsize=64)
@@ -84,7 +84,7 @@ def compose(
     _of_kinds(config=config, task=task, dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher)
     _agree(config, task)
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher, cost=cost)
-    return assembled(config, task, mesh=mesh, logged=logged, **pieces)
+    return assembled(config, task, mesh, logged, **pieces)
 
 
 def _agree(config: settings.Config, task: Task) -> None:
@@ -105,19 +105,10 @@ def _agree(config: settings.Config, task: Task) -> None:
         )
 
 
-def assembled(
-    config: settings.Config,
-    task: Task,
-    *,
-    dynamics: Dynamics | None = None,
-    policy: Policy | None = None,
-    fitter: ModelLearner | None = None,
-    searcher: PolicyOptimizer | None = None,
-    cost: Cost | Callable[..., Array] | None = None,
-    mesh: Mesh | None = None,
-    logged: int = 0,
-) -> Experiment:
+def assembled(config: settings.Config, task: Task, mesh: Mesh | None, logged: int, **pieces: Any) -> Experiment:
     """`compose` with a task that may know less than its config, as that of a run's folder does."""
+    names = ("dynamics", "policy", "fitter", "searcher", "cost")
+    dynamics, policy, fitter, searcher, cost = (pieces.get(name) for name in names)
     task = remembering(config, checked(task._replace(cost=as_cost(task.cost))))
     task = tasks.whole(task, None if cost is None else as_cost(cost))
     dynamics = dynamics or dynamics_of(config.model, task)

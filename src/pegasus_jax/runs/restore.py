@@ -40,7 +40,7 @@ def restored(run: Path, trial: Trial = LAST, task: Task | None = None) -> tuple[
     """
     config = config_io.load(store.existing(run) / "config.yaml")
     with precision(config):
-        experiment = assembled(config, task or _unplanted(run, config), logged=logged.of_run(config, run).rows)
+        experiment = assembled(config, task or _unplanted(run, config), None, logged.of_run(config, run).rows)
         like = jax.eval_shape(experiment.init, jax.random.key(0))
         return config, experiment, _state(run, trial, like)
 

@@ -96,7 +96,7 @@ def driven(config: Config, params: Params, seeds: range) -> Iterator[tuple[Traje
     """
     task, look, drawn = tasks.of_config(config), tasks.camera(config), list[np.ndarray]()
     watched = task._replace(environment=filmed(task.environment, look, max(1, round(EVERY / task.dt)), drawn))
-    drive: Any = assembled(config, watched).drive
+    drive: Any = assembled(config, watched, None, 0).drive
     for seed in seeds:
         ran = drive(jax.random.key(seed), params, False)
         failed(ran, task, kept=False)
