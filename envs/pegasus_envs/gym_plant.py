@@ -135,9 +135,9 @@ def env_spec(
     high = filled("control_high", control_high, controls.shape[0], controls.high)
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         raise ValueError(f"its controls have no limits: {controls}; give control_low= and control_high=")
+    # A box may have limits in single precision, and a number that is typed has not.
+    kind = controls.dtype.type if np.issubdtype(controls.dtype, np.floating) else float  # type: ignore[union-attr]
     for least, greatest, bottom, top in zip(low, high, controls.low, controls.high, strict=True):
-        # A box may have limits in single precision, and a number that is typed has not.
-        kind = controls.dtype.type if np.issubdtype(controls.dtype, np.floating) else float  # type: ignore[union-attr]
         if not (bottom <= kind(least) and least < greatest and kind(greatest) <= top):
             raise ValueError(
                 f"controls from {least:g} to {greatest:g} are not among its own, from {bottom:g} to {top:g}"

@@ -323,9 +323,9 @@ def check_episode(state: RunState, trajectory: Trajectory, controls: int) -> Non
         check_shape(f"an episode's {name}", getattr(trajectory, name), shape)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state.data.size, trajectory))):
         return
-    length = horizon if trajectory.length is None else int(trajectory.length)
-    if not 0 <= length <= horizon or length != (trajectory.length if trajectory.length is not None else length):
-        raise ValueError(f"an episode's length is {trajectory.length}; expected a whole number from 0 to {horizon}")
+    told: Any = horizon if trajectory.length is None else trajectory.length
+    if (length := int(told)) != told or not 0 <= length <= horizon:
+        raise ValueError(f"an episode's length is {told}; expected a whole number from 0 to {horizon}")
     for name, rows in (("x", trajectory.x[: length + 1]), ("u", trajectory.u[:length])):
         for t, i in np.argwhere(~np.isfinite(np.asarray(rows)))[:1]:
             raise ValueError(f"an episode's {name}[{t}, {i}] is {rows[t, i]}; expected finite numbers")

@@ -1,4 +1,4 @@
-"""Config -> Experiment: the pieces that the settings name, or your own, assembled."""
+"""Config -> Experiment: the pieces that the settings name, or your own, composed."""
 
 from collections.abc import Callable
 from functools import lru_cache, partial

@@ -1,7 +1,7 @@
 """Which columns of a table are the observation, the controls, the time and the episode."""
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -82,9 +82,7 @@ def layout(table: Table, names: Names, columns: Sequence[str], dt: float) -> tup
     taken = {column.name for column in said.values()} or {*own.values()}
     found = times.known(table.names, taken)
     time = said.get("t") or (found and Column(*found))
-    labels = {table.names[column] for _, column in table.texts}  # in capitals it may be another thing
-    alike = [name for name in table.names if name.casefold() == EPISODE and name not in {*taken, *labels - {EPISODE}}]
-    episode = said[EPISODE].name if EPISODE in said else EPISODE if EPISODE in alike else next(iter(alike), None)
+    episode = said[EPISODE].name if EPISODE in said else _episode(table, taken)
     called = {column: name for name, column in own.items()}
     other = [f"{c.name} is taken for {n}" for n, c in said.items() if called.get(c.name, n) != n]
     note = f"by {SETTING}=, {', and '.join(other)}" if other else ""
@@ -111,6 +109,13 @@ def layout(table: Table, names: Names, columns: Sequence[str], dt: float) -> tup
     return Layout(
         tuple(said[name] for name in names.observation), tuple(said[name] for name in names.control), time, episode
     ), note
+
+
+def _episode(table: Table, taken: Set[str]) -> str | None:
+    """The column that tells episodes apart, if there is one. Written in capitals it may be labels, which are none."""
+    alike = [name for name in table.names if name.casefold() == EPISODE and name not in taken]
+    labels = {table.names[column] for _, column in table.texts}
+    return EPISODE if EPISODE in alike else next((name for name in alike if name not in labels), None)
 
 
 def _beside(table: Table, columns: Sequence[str], names: Names, dt: float | None) -> str:
@@ -192,12 +197,16 @@ def matched(columns: Sequence[str], names: Sequence[str]) -> dict[str, str]:
     """
     found = {name: name for name in names if name in columns}
     for form in (plain, loose):
-        columns_left = [form(column) for column in columns if column not in found.values()]
-        names_left = [form(name) for name in names if name not in found]
-        sure = {text for text in names_left if names_left.count(text) == columns_left.count(text) == 1}
-        left = {form(column): column for column in columns if column not in found.values()}
-        found |= {name: left[form(name)] for name in names if name not in found and form(name) in sure}
+        open_ = _alone([name for name in names if name not in found], form)
+        left = _alone([column for column in columns if column not in found.values()], form)
+        found |= {open_[text]: left[text] for text in open_ if text in left}
     return found
+
+
+def _alone(texts: Sequence[str], form: Callable[[str], str]) -> dict[str, str]:
+    """Form -> the text that has it, of forms that one text has alone."""
+    forms = [*map(form, texts)]
+    return {one: text for one, text in zip(forms, texts, strict=True) if forms.count(one) == 1}
 
 
 def numbers(table: Table, column: Column) -> np.ndarray:

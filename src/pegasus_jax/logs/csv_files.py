@@ -13,10 +13,9 @@ from pegasus_jax.logs.table import Table, reason
 def of_csv(path: Path) -> Table:
     """The table of a text file, cells apart by commas, semicolons or tabs; a first line that is no numbers is a header.
 
-    Between semicolons a decimal comma is one.
-
-    Empty lines, and those that begin with #, are left out. Of the latter the last before the first row is a header
-    too if it can be, as NumPy writes it. Raises ConfigError, with the line, for a row of another length.
+    Between semicolons a comma is a decimal one. Empty lines, and those that begin with #, are left out. Of the
+    latter the last before the first row is a header too if it can be, as NumPy writes it. Raises ConfigError, with
+    the line, for a row of another length.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -29,18 +28,16 @@ def of_csv(path: Path) -> Table:
     cells = [_cells(f"{path} line {number}", line, comma) for number, line in kept]
     while len({*map(len, cells)}) == 1 < len(cells[0]) and not any(row[-1] for row in cells):  # of a comma at its end
         cells = [row[:-1] for row in cells]
-    if comma == ";":  # as where a comma is the decimal mark
-        cells = [[_pointed(cell) for cell in row] for row in cells]
     remarks = [line for line in lines[: kept[0][0] - 1] if line[:1] == "#"]
     above = [cell.strip() for cell in remarks[-1].lstrip("#").split(comma)] if remarks else []
-    names, header = _header(cells[0], above, cells[1] if len(cells) > 1 else cells[0])
+    names, header = _header(cells[0], above, cells[1] if len(cells) > 1 else cells[0], comma)
     body, places = cells[header:], np.array([number for number, _ in kept][header:], int)
     if twice := [name for name in names if names.count(name) > 1]:
         raise ConfigError(f"{path} has two columns called {twice[0]!r}; expected names that differ")
     if wrong := [(line, row) for line, row in zip(places, body, strict=True) if len(row) != len(names)]:
         line, row = wrong[0]
         raise ConfigError(f"{path} line {line} has {len(row)} columns; expected {len(names)}, as in its first row")
-    numbers = [[_number(cell) for cell in row] for row in body]
+    numbers = [[_number(cell, comma) for cell in row] for row in body]
     texts = {
         (i, j): body[i][j]
         for i, row in enumerate(numbers)
@@ -66,31 +63,27 @@ def _mark(lines: list[str]) -> str:
     for mark in ";\t,":
         rows = [next(csv.reader([line], delimiter=mark), []) for line in (*lines[:2], lines[-1])]
         last = [cell.strip() for cell in rows[-1]]
-        numbers = not any(cell and _number(_pointed(cell) if mark == ";" else cell) is None for cell in last)
+        numbers = not any(cell and _number(cell, mark) is None for cell in last)
         if numbers and len(last) > 1 and {*map(len, rows)} == {len(last)}:
             return mark
     return next((mark for mark in ",;\t" if mark in lines[0]), ",")
 
 
-def _header(first: list[str], above: list[str], second: list[str]) -> tuple[tuple[str, ...], bool]:
+def _header(first: list[str], above: list[str], second: list[str], mark: str) -> tuple[tuple[str, ...], bool]:
     """The names of the columns, of the first row and the remark above it, and whether that row is them and no data."""
     numbered = [str(i) for i in range(len(first))]
     # Pandas writes the numbers of an array's columns behind an empty cell, which is over those of its rows.
     of_array = not first[0] and bool(second[0]) and all(cell.isdecimal() for cell in first[1:])
-    if of_array or any(cell and _number(cell) is None for cell in first):
+    if of_array or any(cell and _number(cell, mark) is None for cell in first):
         return tuple(first), True
-    if len(above) == len(first) and all(cell and _number(cell) is None for cell in above):
+    if len(above) == len(first) and all(cell and _number(cell, mark) is None for cell in above):
         return tuple(above), False
     return tuple(numbered), first == numbered  # as pandas writes the columns of an array
 
 
-def _pointed(cell: str) -> str:
-    """A number with a decimal comma as one with a point; any other cell as it is."""
-    return cell.replace(",", ".") if cell.count(",") == 1 and _number(cell.replace(",", ".")) is not None else cell
-
-
-def _number(cell: str) -> float | None:
+def _number(cell: str, mark: str) -> float | None:
+    """A cell's number, whose decimal mark may be a comma where a semicolon is between the cells; None: it is none."""
     try:
-        return float(cell)
+        return float(cell.replace(",", ".") if mark == ";" else cell)
     except ValueError:
         return None

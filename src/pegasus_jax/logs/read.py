@@ -4,7 +4,7 @@ import glob
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -58,7 +58,7 @@ def read(
 ) -> tuple[list[Logged], list[str]]:
     """(the episodes of logs, in parts of at most a horizon; notes on what was decided, one line each)."""
     notes: dict[str, list[str]] = {}  # text -> the files of which it is true
-    found: list[tuple[Segment, str, tuple[str, ...], Any]] = []
+    found: list[tuple[Segment, str, tuple[str, ...], dict[str, float]]] = []
     names, goals = names_of(task), goal_names(task)
     for table in tables(files, names, columns, control):
 
@@ -72,8 +72,8 @@ def read(
         if not pieces:
             note("no two rows follow each other; left out")
         used = tuple(map(str, (*where.observation, *where.control)))
-        goal = np.array([table.remembered[name] for name in goals]) if {*goals} <= {*table.remembered} else None
-        if goal is None:
+        goal = {name: table.remembered[name] for name in goals if name in table.remembered}
+        if len(goal) < len(goals):
             note("it does not tell the goals of its episodes; one that is drawn stands for all")
         whole = (one for piece in pieces if (one := periods(piece, task, note)) is not None)
         found += [(one, table.source, used, goal) for one in whole]
@@ -115,8 +115,8 @@ def _table(path: Path, names: Names, columns: Sequence[str], control: str) -> Ta
     raise ConfigError(f"data={path} is no log that we read; expected .csv, .npz, {', '.join(bags.SUFFIXES)}")
 
 
-def _trajectories(found: Sequence[tuple[Segment, str, tuple[str, ...], Any]], task: Task) -> list[Logged]:
-    """Parts of at most H periods, each with its costs and what is remembered at its start, its goal [G] if it is known.
+def _trajectories(found: Sequence[tuple[Segment, str, tuple[str, ...], dict[str, float]]], task: Task) -> list[Logged]:
+    """Parts of at most H periods, each with its costs and what is remembered at its start, its goal if it is known.
 
     Raises ConfigError where a cost is not a finite number.
     """
@@ -127,12 +127,11 @@ def _trajectories(found: Sequence[tuple[Segment, str, tuple[str, ...], Any]], ta
     def known(whole: Trajectory) -> tuple[Array, Array | None]:
         return episode.costs(task, whole), recall.replay(task.memory, whole)
 
-    places = np.array([task.memory.names.index(name) for name in goal_names(task)], int)
     for one, source, columns, goal in found:
         x, u, m = with_rates(one.x, task).astype(kind), one.u.astype(kind), None
-        if goal is not None and len(goal):
-            m = np.asarray(recall.begin(task.memory, jax.random.key(0), jnp.asarray(x[0]))).copy()
-            m[places] = goal
+        if goal:
+            m = np.array(recall.begin(task.memory, jax.random.key(0), jnp.asarray(x[0])))
+            m[[task.memory.names.index(name) for name in goal]] = [*goal.values()]
         for i in range(0, len(u), size):
             rows = u[i : i + size]
             part = Trajectory(x[i : i + size + 1], rows, np.zeros(len(rows), kind), memory=m)  # type: ignore[arg-type]
