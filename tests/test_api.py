@@ -519,12 +519,47 @@ def test_an_episode_names_what_is_wrong_with_it() -> None:
         experiment.add_episode(state, good._replace(x=jnp.zeros((H + 1, D), int)))
 
 
-def test_a_policy_that_answers_wrongly_is_named_before_the_plant_moves() -> None:
-    wrong = POLICY._replace(apply=lambda params, noise, x: x)
-    experiment = pg.compose(CONFIG, TASK, policy=wrong)
-    state = experiment.init(key())
-    with pytest.raises(ValueError, match=r"what policy\.apply returns has shape \(2,\); expected \[U\] \(1,\)"):
-        jax.eval_shape(experiment.collect, state)
+def wrong_model(**functions: Any) -> dict[str, Any]:
+    return dict(dynamics=DYNAMICS._replace(**functions))
+
+
+def wrong_policy(**functions: Any) -> dict[str, Any]:
+    return dict(policy=POLICY._replace(**functions))
+
+
+WRONG_PIECES: list[tuple[dict[str, Any], str]] = [
+    (
+        wrong_policy(apply=lambda params, noise, x: x),
+        r"what policy\.apply returns has shape \(2,\); expected \[U\] \(1,\)",
+    ),
+    (wrong_policy(apply=lambda params, noise, x: None), r"what policy\.apply returns is a NoneType; .* array \[U\]"),
+    (wrong_policy(apply=lambda params, x: x[:1]), r"policy\.apply: TypeError: .* 2 positional .*\(test_api\.py:\d+\)"),
+    (wrong_policy(init=None), r"policy\.init=None is no function"),
+    (wrong_policy(init=lambda key: {"gain": 3}), r"what policy\.init returns\['gain'\] is of int32; expected floating"),
+    (wrong_model(loss=lambda *_: jnp.zeros(3)), r"what dynamics\.loss returns has shape \(3,\); expected \(\)"),
+    (wrong_model(loss=lambda *_: None), r"what dynamics\.loss returns is a NoneType; expected an array \(\)"),
+    (wrong_model(loss=lambda *_: 3), r"what dynamics\.loss returns is of int32; expected floating"),
+    (wrong_model(init=lambda key: {"w": 3}), r"what dynamics\.init returns\['w'\] is of int32; expected floating"),
+    (wrong_model(prepare=None), r"dynamics\.prepare=None is no function"),
+    (wrong_model(posterior=lambda params: params), r"dynamics\.posterior: TypeError: .* 1 positional"),
+    (wrong_model(apply=lambda *_: jnp.zeros(2)), r"dynamics\.apply returns an array; expected Prediction\("),
+    (
+        wrong_model(apply=lambda *_: pg.Prediction(jnp.zeros(3), jnp.ones(2))),
+        r"mean of what dynamics\.apply returns has shape \(3,\); expected \[D\] \(2,\)",
+    ),
+]
+
+
+@pytest.mark.parametrize(("piece", "message"), WRONG_PIECES)
+def test_a_piece_that_answers_wrongly_is_named_before_anything_is_composed(piece: dict[str, Any], message: str) -> None:
+    with pytest.raises(pg.ConfigError, match=f"^{message}"):
+        pg.compose(CONFIG, TASK, **piece)
+
+
+def test_a_model_that_is_not_fitted_by_its_loss_needs_none() -> None:
+    fitter = pg.minibatches(DYNAMICS, optax.adam(1e-3), batch_size=5)
+    known = DYNAMICS._replace(loss=None, prepare=None)  # type: ignore[arg-type]
+    assert pg.compose(CONFIG, TASK, dynamics=known, fitter=fitter).dynamics.loss is None
 
 
 def test_the_cost_of_a_task_is_one_of_an_objective() -> None:

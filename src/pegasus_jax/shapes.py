@@ -5,10 +5,12 @@ from typing import Any
 import chex
 import jax
 import jax.numpy as jnp
+import numpy as np
 
-from pegasus_jax.types import Dataset, Params, Scenarios, TrainState
+from pegasus_jax.types import Dataset, Params, Prediction, Scenarios, TrainState
 
 Shape = tuple[int | None, ...]  # None: any size
+ARRAYS = (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct, float, int)
 
 
 def check_shape(name: str, value: Any, shape: Shape, index: str = "") -> None:
@@ -16,15 +18,37 @@ def check_shape(name: str, value: Any, shape: Shape, index: str = "") -> None:
 
     `index` are the letters of its axes, for the message: "[K, D]".
     """
+    letters = f" {index}" if index else ""
+    if not isinstance(value, ARRAYS):
+        raise ValueError(f"{name} is a {type(value).__name__}; expected an array{letters} {_written(shape)}")
     try:
         chex.assert_shape(value, shape)
     except AssertionError:
-        letters = f" {index}" if index else ""
         raise ValueError(f"{name} has shape {jnp.shape(value)}; expected{letters} {_written(shape)}") from None
     try:
         chex.assert_type(value, float)
     except AssertionError:
         raise ValueError(f"{name} is of {jnp.result_type(value)}; expected floating-point numbers") from None
+
+
+def check_floating(name: str, tree: Params) -> None:
+    """Raises ValueError unless every array of `tree` has floating-point entries: gradients are of no others."""
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            where = name + jax.tree_util.keystr(path)
+            raise ValueError(f"{where} is of {jnp.result_type(leaf)}; expected floating-point numbers")
+
+
+def check_prediction(name: str, value: Any, shape: Shape, index: str) -> None:
+    """Raises ValueError unless what dynamics.apply returns is a `Prediction` of arrays of this shape.
+
+    `name` says of what: "dynamics.apply returns for K particles".
+    """
+    if not isinstance(value, Prediction):
+        kind = "n array" if isinstance(value, jax.Array) else f" {type(value).__name__}"
+        raise ValueError(f"dynamics.apply returns a{kind}; expected Prediction(mean [D], std [D])")
+    for field, array in value._asdict().items():
+        check_shape(f"{field} of what {name}", array, shape, index)
 
 
 def check_particles(name: str, tree: Params, particles: int) -> None:

@@ -12,6 +12,7 @@ from jax.sharding import Mesh
 
 from pegasus_jax import config as settings
 from pegasus_jax import episode, tasks
+from pegasus_jax.assembly.own_pieces import try_dynamics, try_policy
 from pegasus_jax.assembly.pieces import drawing_rates, dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import fresh_policies, limits, refines_successes, search_of
 from pegasus_jax.checks import ConfigError, shown
@@ -111,6 +112,10 @@ def assembled(config: settings.Config, task: Task, mesh: Mesh | None, logged: in
     dynamics, policy, fitter, searcher, cost = (pieces.get(name) for name in names)
     task = remembering(config, checked(task._replace(cost=as_cost(task.cost))))
     task = tasks.whole(task, None if cost is None else as_cost(cost))
+    if dynamics is not None:
+        try_dynamics(dynamics, task, fits=fitter is None)
+    if policy is not None:
+        try_policy(policy._replace(memory=task.memory) if task.memory.names else policy, task)
     dynamics = dynamics or dynamics_of(config.model, task)
     fitter = fitter or drawing_rates(fit_of(config.fit, dynamics), dynamics, task)
     if task.prior is not None:  # then all of that is of what the simulator gets wrong

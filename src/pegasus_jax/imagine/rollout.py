@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 
 from pegasus_jax import memory as recall
-from pegasus_jax.shapes import check_params, check_scenarios, check_shape
-from pegasus_jax.types import Array, Dynamics, Params, Policy, Prediction, Rollout, Scenarios
+from pegasus_jax.shapes import check_params, check_prediction, check_scenarios, check_shape
+from pegasus_jax.types import Array, Dynamics, Params, Policy, Rollout, Scenarios
 from pegasus_jax.vectorized import for_particles
 
 # Platform -> steps of the time loop compiled as one. Each round of a loop costs a GPU copies and launches
@@ -62,12 +62,7 @@ def rollout(
         u = act(policy_params, scenarios.policy, see(m, o))
         check_shape("what policy.apply returns for K particles", u, (len(x), None), "[K, U]")
         change = predict(posterior, scenarios.dynamics, x, given(m, u))
-        if not isinstance(change, Prediction):
-            raise ValueError(
-                f"dynamics.apply returns a {type(change).__name__}; expected Prediction(mean [D], std [D])"
-            )
-        for name, value in change._asdict().items():
-            check_shape(f"{name} of what dynamics.apply returns for K particles", value, x.shape, "[K, D]")
+        check_prediction("dynamics.apply returns for K particles", change, x.shape, "[K, D]")
         std = jax.lax.stop_gradient(change.std)
         blur = std * sensor
         after = match(recall.join(x + change.mean + noise.state * blur, advance(m, o, u)), redraw)

@@ -1,0 +1,80 @@
+"""A model and a policy that a caller made, tried on shapes alone before anything is composed of them.
+
+What is wrong with one is then a line that names its function, and not a message from inside a fit or a search.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.learn.data import empty
+from pegasus_jax.memory import given_size, seen_names
+from pegasus_jax.shapes import check_floating, check_prediction, check_shape
+from pegasus_jax.task import Task
+from pegasus_jax.tasks.user_code import blamed
+from pegasus_jax.types import Batch, Dynamics, Key, Policy
+
+ROWS = 8  # of the data that a model is tried with
+
+
+def try_dynamics(dynamics: Dynamics, task: Task, fits: bool) -> None:
+    """Raises ConfigError unless a model of one's own takes and returns what `Dynamics` says, for this task.
+
+    `fits` says whether its loss is minimized: a fitter of one's own may have no use for it.
+    """
+    states, inputs = len(task.state_names), given_size(task.memory, len(task.control_names))
+    inputs += states if task.prior is not None else 0  # it is told what the simulator does: models/residual.py
+    more = 0 if task.hindsight is None else task.hindsight.more
+
+    def each(key: Key) -> None:
+        first, second, third = jax.random.split(key, 3)
+        params = called("dynamics", dynamics, "init", first)
+        check_floating("what dynamics.init returns", params)
+        data = empty(ROWS, states, inputs + more, len(task.memory.names))
+        if fits:
+            context, batch = called("dynamics", dynamics, "prepare", data), Batch(data.x, data.u, data.y)
+            loss = called("dynamics", dynamics, "loss", params, second, batch, context)
+            check_shape("what dynamics.loss returns", loss, ())
+        posterior = called("dynamics", dynamics, "posterior", params, data)
+        draw, x, u = called("dynamics", dynamics, "sample", third, posterior), jnp.zeros(states), jnp.zeros(inputs)
+        predicted = called("dynamics", dynamics, "apply", posterior, draw, x, u)
+        check_prediction("dynamics.apply returns", predicted, x.shape, "[D]")
+
+    tried(each)
+
+
+def try_policy(policy: Policy, task: Task) -> None:
+    """Raises ConfigError unless a policy of one's own takes and returns what `Policy` says, for this task."""
+
+    def each(key: Key) -> None:
+        first, second = jax.random.split(key)
+        params = called("policy", policy, "init", first)
+        check_floating("what policy.init returns", params)
+        noise = called("policy", policy, "sample", second)
+        u = called("policy", policy, "apply", params, noise, jnp.zeros(len(seen_names(task))))
+        check_shape("what policy.apply returns", u, (len(task.control_names),), "[U]")
+
+    tried(each)
+
+
+def tried(each: Any) -> None:
+    """The function of a key, traced and not run. Raises ConfigError for whatever it refuses."""
+    try:
+        jax.eval_shape(each, jax.random.key(0))
+    except ConfigError:
+        raise
+    except ValueError as error:  # of what a trace of the pieces would refuse later
+        raise ConfigError(str(error)) from error
+
+
+def called(what: str, piece: Any, name: str, *given: Any) -> Any:
+    """What the function of that name of a piece returns. Raises ConfigError that begins with where it is."""
+    function = getattr(piece, name)
+    if not callable(function):
+        raise ConfigError(
+            f"{what}.{name}={function!r} is no function; expected one, as {type(piece).__name__} in types.py has it"
+        )
+    with blamed(f"{what}.{name}", function):
+        return function(*given)
