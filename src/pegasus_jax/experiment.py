@@ -87,6 +87,9 @@ def trial_key(key: Key, trial: Array | int, purpose: int) -> Key:
     return jax.random.fold_in(jax.random.fold_in(key, trial), purpose)
 
 
+trial_keys = jax.vmap(trial_key, (0, None, None))  # of several runs at once
+
+
 def experiment(
     *,
     task: Task,

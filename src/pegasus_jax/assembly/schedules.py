@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import config as settings
@@ -62,9 +61,12 @@ def at_starts(task: Task) -> np.ndarray:
     def first(x: Array, key: Key) -> Array:
         return costs.of(task.cost, join(x, begin(task.memory, key, x)))
 
-    with jax.ensure_compile_time_eval():
-        x, keys = jnp.asarray(examples(task, STARTS)), jax.random.split(jax.random.key(0), STARTS)
-        return np.asarray(jax.vmap(first)(x, keys))
+    def all_of(x: Array) -> Array:
+        return jax.vmap(first)(x, jax.random.split(jax.random.key(0), STARTS))
+
+    # One program, where operation by operation would be twenty; it may be wanted while another one is traced.
+    x = examples(task, STARTS)
+    return np.asarray(jax.jit(all_of).lower(x).compile()(x))
 
 
 def scale_for(found: np.ndarray) -> float:

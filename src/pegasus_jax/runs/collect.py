@@ -10,11 +10,11 @@ import numpy as np
 from pegasus_jax import episode, interrupt
 from pegasus_jax.checks import RunError
 from pegasus_jax.episode import Episode
-from pegasus_jax.experiment import COLLECT, trial_key
+from pegasus_jax.experiment import COLLECT, trial_keys
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs import store
 from pegasus_jax.runs.job import Job
-from pegasus_jax.runs.programs import gather, is_main_process
+from pegasus_jax.runs.programs import gather, is_main_process, quick
 from pegasus_jax.task import Task
 from pegasus_jax.tasks import user_code
 from pegasus_jax.types import RunState, Trajectory
@@ -53,7 +53,7 @@ def gathered(
 ) -> list[Episode]:
     """The known episodes, and for those that are not, ones that are run on the plant and handed to the writer."""
     task, random = job.experiment.task, job.random(trial)
-    keys = jax.vmap(lambda key: trial_key(key, trial, COLLECT))(gather(states.key))
+    keys = quick(trial_keys)(gather(states.key), trial, COLLECT)
     fresh = job.program.collect(keys, states.policy.params, random)
     for index, ran in enumerate(fresh):
         if known[index] is None:

@@ -1,5 +1,7 @@
 """How good policies are on their plant, by episodes that never become data."""
 
+from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +14,7 @@ from pegasus_jax.episode import Episode
 from pegasus_jax.imagine.limits import margin
 from pegasus_jax.runs import checkpoint, restore
 from pegasus_jax.runs.collect import failed
-from pegasus_jax.runs.programs import Program
+from pegasus_jax.runs.programs import Program, over_episodes, quick
 from pegasus_jax.task import Task
 from pegasus_jax.types import Key, Params
 
@@ -23,7 +25,7 @@ def evaluate(keys: Key, params: Params, task: Task, program: Program, episodes: 
     """Mean cost a step and success rate of each seed [S], over fresh episodes, not data (docs/reference.md 10)."""
     if not episodes:
         return [UNMEASURED] * len(keys)
-    keys = jax.vmap(lambda key: jax.random.split(key, episodes))(keys)
+    keys = quick(splitting(episodes))(keys)
     costs = program.evaluate(keys, params) if task.environment is None else driven(keys, params, task, program)
     return [
         {"mean_cost": float(np.mean(cost)), "success_rate": float(np.mean(success))}
@@ -31,10 +33,16 @@ def evaluate(keys: Key, params: Params, task: Task, program: Program, episodes: 
     ]
 
 
+@cache
+def splitting(episodes: int) -> Callable[[Key], Key]:
+    """keys [S] -> keys [S, E]."""
+    return jax.vmap(lambda key: jax.random.split(key, episodes))
+
+
 def driven(keys: Key, params: Params, task: Task, program: Program) -> np.ndarray:
     """Costs [S, E, H] of episodes on an environment, the periods that an early end left out included."""
     costs = []
-    for some in jnp.swapaxes(keys, 0, 1):
+    for some in over_episodes(keys):
         for ran in program.collect(some, params, False, purpose="evaluate"):
             failed(ran, task, kept=False)
             costs.append(episode.charged(ran.trajectory.cost, task))

@@ -2,7 +2,7 @@
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from contextlib import AbstractContextManager, nullcontext
 from copy import copy
@@ -201,7 +201,7 @@ class Program:
         follow = np.asarray(False)  # the policy, not random controls
         if self.side_by_side:
             return gather(self("evaluate", keys, params, follow).cost)
-        several = (self("episode", some, params, follow, purpose="evaluate") for some in jnp.swapaxes(keys, 0, 1))
+        several = (self("episode", some, params, follow, purpose="evaluate") for some in over_episodes(keys))
         return np.stack([gather(episode.cost) for episode in several], axis=1)
 
     def seconds(self) -> dict[str, float]:
@@ -249,6 +249,12 @@ def compiler_options(by_platform: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """The compiler's options for the platform at hand: those that its version has, and XLA_FLAGS does not speak of."""
     wanted, told = by_platform.get(jax.default_backend(), {}), os.environ.get("XLA_FLAGS", "")
     return {name: value for name, value in wanted.items() if name not in told and _has(name, value)}
+
+
+@cache
+def quick(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function jitted, for what takes longer to compile than it ever runs: the keys of a trial."""
+    return jax.jit(function, compiler_options=compiler_options(ONCE))
 
 
 @cache
@@ -316,6 +322,12 @@ def gather(tree: Any) -> Any:
         return np.asarray(multihost_utils.process_allgather(leaf, tiled=True) if several else leaf)
 
     return jax.tree.map(get, tree)
+
+
+def over_episodes(keys: Any) -> Iterator[Any]:
+    """Of keys [S, E] those [S] of each of the E episodes, without a program that would take them apart."""
+    numbers = np.asarray(jax.random.key_data(keys))
+    return (jax.random.wrap_key_data(numbers[:, episode]) for episode in range(numbers.shape[1]))
 
 
 def is_main_process() -> bool:

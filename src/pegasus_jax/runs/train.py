@@ -11,14 +11,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh
 
 from pegasus_jax import episode
 from pegasus_jax.config import Config, begins_with, first_search
-from pegasus_jax.experiment import EVALUATE, trial_key
+from pegasus_jax.experiment import EVALUATE, trial_keys
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.logs.read import Logged
@@ -28,7 +27,7 @@ from pegasus_jax.runs.collect import collected, costs_since, stacked
 from pegasus_jax.runs.display import learned
 from pegasus_jax.runs.evaluation import UNMEASURED, evaluate, kept_to, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
-from pegasus_jax.runs.programs import Program, gather, is_main_process
+from pegasus_jax.runs.programs import Program, gather, is_main_process, quick
 from pegasus_jax.runs.stuck import stuck
 from pegasus_jax.runs.writers import Row, part
 from pegasus_jax.task import Task
@@ -221,7 +220,7 @@ def evaluated(job: Job, states: RunState, trial: int, ended: float) -> Callable[
     task, program, count = job.experiment.task, job.program, job.config.eval_episodes
 
     def measured(program: Program) -> list[Row]:
-        keys = jax.vmap(lambda key: trial_key(key, trial, EVALUATE))(gather(states.key))
+        keys = quick(trial_keys)(gather(states.key), trial, EVALUATE)
         return evaluate(keys, states.policy.params, task, program, count)
 
     now = None
