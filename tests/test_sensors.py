@@ -9,6 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import onnxruntime
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.signal import savgol_filter
 
 import folders
@@ -24,10 +26,11 @@ from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.math.units import rate_of
 from pegasus_jax.models.smoothed import alternating, corrected, draw_rates
 from pegasus_jax.policies.rate_limited import rate_limited
-from pegasus_jax.runs import config_io
+from pegasus_jax.runs import config_io, facts
 from pegasus_jax.runs.controller import controller
+from pegasus_jax.start import preset
 from pegasus_jax.tasks.remembered import remembering, smoothed
-from pegasus_jax.tasks.sensed import sensed
+from pegasus_jax.tasks.sensed import coordinates, sensed
 from pegasus_jax.types import Batch, Dataset, Dynamics, ModelLearner, Prediction, Scenarios, TrainState
 from probes import PLAIN, cart, linear_policy, tiny
 
@@ -355,6 +358,48 @@ class Slide(gymnasium.Env):
 
 
 gymnasium.register("Slide-v0", Slide)
+
+
+class Five(gymnasium.Env):
+    """Two coordinates, an entry that is neither, and the rates of both."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (5,))
+    action_space = gymnasium.spaces.Box(-2.0, 2.0, (1,))
+    state_names = ("q", "p", "volt", "q'", "p'")
+    dt = DT
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(5), {}
+
+
+gymnasium.register("Five-v0", Five)
+
+
+def five(measured, **words):
+    known = dict(env="Five-v0", cost=lambda x: x[0] ** 2, horizon=8, start_mean=[0] * 5, rates=[3, 4], **words)
+    return tasks.of_config(tasks.resolve(preset("gym", settings=known | {"sensors.measured": measured})))
+
+
+@given(st.sets(st.integers(0, 4), min_size=1).flatmap(lambda kept: st.permutations(sorted(kept))))
+@settings(max_examples=40, deadline=None)
+def test_a_rate_stays_with_what_it_is_the_rate_of(measured):
+    """Whatever is measured, in whatever order: all of it is in pairs, or none of it counts as one."""
+    task = five(measured)
+    assert task.state_names == tuple(Five.state_names[i] for i in measured)
+    pairs = [(task.state_names[i], task.state_names[r]) for i, r in zip(coordinates(task), task.rates, strict=False)]
+    whole = {*measured} == {0, 1, 3, 4}
+    assert pairs == ([(q, f"{q}'") for q in task.state_names if q in ("q", "p")] if whole else [])
+
+
+def test_no_rate_of_a_rate_is_computed_and_none_is_taken_for_another():
+    with pytest.raises(ConfigError, match=r"q' is a rate itself; the nearest is sensors.measured=\[0,1,2\]"):
+        five([0, 3], **{"sensors.velocity": "difference"})
+    with pytest.raises(ConfigError, match="model=lagrangian needs a state of coordinates and their rates"):
+        tasks.rates_of(five([0, 4]))
+    now, before = (facts.of_task(five([0, 3])) | {"rates": rates} for rates in ([], [1]))
+    assert "its rates was" in str(facts.difference(before, now))  # a pair once, and now not known to be one
+    now, before = (facts.of_task(five([0, 1, 3])) | {"rates": rates} for rates in ([], [2]))
+    assert facts.difference(before, now) is None
 
 
 def squared(x):

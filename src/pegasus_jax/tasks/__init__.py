@@ -177,7 +177,7 @@ def from_gym(config: Config) -> Task:
         environment=env_plant(name, config.env_args, len(states), about.state_names),
         starts=about.starts if len(about.starts) else None,
     )
-    return circled.start_moments(circled.of_angles(*sensed.chosen(task, config.sensors.measured, config.circles or ())))
+    return circled.start_moments(circled.of_angles(*sensed.chosen(task, config.sensors, config.circles or ())))
 
 
 def close_environments() -> None:

@@ -32,7 +32,7 @@ def sensed(task: Task, sensors: Sensors) -> Task:
         )
     computed = sensors.velocity != "none"
     if task.environment is not None:
-        return with_rates(task, sensors.velocity) if computed else task
+        return with_rates(task) if computed else task
     kept = measured = entries(task, sensors)
     if computed:
         rate_of = dict(zip(coordinates(task), task.rates, strict=True))
@@ -50,7 +50,7 @@ def entries(task: Task, sensors: Sensors) -> list[int]:
             raise ConfigError(f"sensors.measured={entry} is not an entry; choose from 0 to {len(names) - 1}")
     if sensors.velocity == "none":
         return measured
-    if not task.rates:
+    if not task.rates and task.environment is None:  # of an environment it is known what rates= says
         raise ConfigError(
             f"sensors.velocity={sensors.velocity} needs to know which entries are rates, and of task={task.name} it is"
             " not known; the nearest is sensors.velocity=none history=3"
@@ -140,14 +140,14 @@ def delayed(task: Task, delay: int) -> Task:
     return task._replace(plant=late._replace(**films))
 
 
-def chosen(task: Task, measured: Sequence[int], circles: Circles) -> tuple[Task, Circles]:
-    """The task of an environment of which these entries are measured, all of them where none is named; and circles.
+def chosen(task: Task, sensors: Sensors, circles: Circles) -> tuple[Task, Circles]:
+    """The task of an environment of which some entries are measured, all of them where none is named; and circles.
 
-    What its user wrote is of these entries, in this order. Raises ConfigError where they are not there.
+    What its user wrote is of these entries, in this order. Raises ConfigError as `entries`.
     """
-    if not measured:
+    keep = entries(task, sensors)
+    if not sensors.measured:
         return task, circles
-    keep = entries(task, Sensors(measured=tuple(measured)))
     place, environment = np.array(keep), task.environment
 
     def step(control: np.ndarray) -> tuple[Any, ...]:
@@ -188,24 +188,33 @@ def _picked(task: Task, kept: Sequence[int]) -> dict[str, Any]:
     known = {name: value for name in of_each if (value := getattr(task, name)) is not None}
     return dict(
         angles=tuple(kept.index(i) for i in task.angles if i in kept),
-        rates=tuple(kept.index(i) for i in task.rates if i in kept),
+        rates=_paired(task, kept),
         state_names=tuple(task.state_names[i] for i in kept),
         **{name: np.asarray(value)[..., place] for name, value in known.items()},
     )
 
 
-def with_rates(task: Task, velocity: str) -> Task:
+def _paired(task: Task, kept: list[int]) -> tuple[int, ...]:
+    """Which of these entries are rates, in the order of those whose rates they are.
+
+    (), as of a task that is not known to be made of such pairs, where one of a pair is kept without the other. Of a
+    task with more other entries than rates, what is dropped has none.
+    """
+    others = coordinates(task)
+    if len(others) > len(task.rates):
+        others = [i for i in others if i in kept]
+    if len(others) != len(task.rates):
+        return ()
+    rate_of = dict(zip(others, task.rates, strict=True))
+    rates = [rate_of[i] for i in kept if i in rate_of]
+    return tuple(map(kept.index, rates)) if {*rates} == {*kept} & {*task.rates} else ()
+
+
+def with_rates(task: Task) -> Task:
     """The task of an environment that measures positions [n], its state [2 n] them and their rates behind them.
 
-    The rates of an episode's rows are differences from the row before; those of the first row are 0. Raises ConfigError
-    where an entry is a rate already.
+    The rates of an episode's rows are differences from the row before; those of the first row are 0.
     """
-    if task.rates:
-        raise ConfigError(
-            f"sensors.velocity={velocity} computes the rates of all that is measured, and"
-            f" {task.state_names[task.rates[0]]} is a rate itself; the nearest is"
-            f" rates=[] sensors.measured=[{','.join(map(str, coordinates(task)))}]"
-        )
     n, environment, dt = len(task.state_names), task.environment, task.dt
     turning, before = list(task.angles), np.zeros(0)
 
