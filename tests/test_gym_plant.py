@@ -13,14 +13,18 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
 
+from pegasus_envs import gym_plant
 from pegasus_envs.gym_plant import close_environments, env_plant, env_spec, make_env, period
-from pegasus_jax import episode, interrupt
+from pegasus_jax import episode, interrupt, tasks
 from pegasus_jax.assembly.experiments import compose
-from pegasus_jax.checks import RunError
+from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io, store
 from pegasus_jax.runs.collect import failed
+from pegasus_jax.start import preset
 from pegasus_jax.task import Task
 from pegasus_jax.tasks import assumed
 from pegasus_jax.types import Cost
@@ -253,6 +257,42 @@ def test_constructor_arguments_are_what_they_look_like() -> None:
     gymnasium.register("Asks-v0", lambda **given: seen.update(given) or Base())
     make_env("Asks-v0", ("port=/dev/ttyACM0", "baud=9600", "fast=true"))
     assert seen == {"port": "/dev/ttyACM0", "baud": 9600, "fast": True}
+    for text, value in {"False": False, "None": None, "True": True, "null": None}.items():
+        make_env("Asks-v0", (f"fast={text}",))
+        assert seen["fast"] is value
+
+
+@given(
+    st.recursive(
+        st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text(),
+        lambda inner: st.lists(inner, max_size=3) | st.dictionaries(st.text(), inner, max_size=3),
+        max_leaves=5,
+    )
+)
+@settings(max_examples=60, deadline=None)
+def test_a_value_from_python_reaches_the_constructor_as_it_is(value: Any) -> None:
+    """Also from the config.yaml of a run; a list of numbers of NumPy, or a tuple, as a list."""
+    assume("${" not in str(value))
+    config = config_io.override(
+        Config(task="gym"), {"env_args": preset("gym", settings={"env_args.x": value}).env_args}
+    )
+    (pair,) = config_io.stored_config(config_io.plain(config)).env_args
+    assert pair.startswith("x=")
+    found = gym_plant._value(pair.removeprefix("x="))
+    assert found == value
+    assert type(found) is type(value)
+
+
+def test_what_no_folder_can_keep_is_no_argument() -> None:
+    made = {given: preset("gym", settings={"env_args.x": given}).env_args for given in ((1, 2), np.float32(0.5))}
+    assert made == {(1, 2): ("x=[1, 2]",), np.float32(0.5): ("x=0.5",)}
+    with pytest.raises(
+        ConfigError, match=r"env_args.x is of type object, which a run's folder cannot keep; expected a"
+    ):
+        preset("gym", settings={"env_args.x": object()})
+    assert tasks.of_config(preset("cartpole", settings={"env_args.pole_mass": "0.4"})).horizon
+    with pytest.raises(ConfigError, match=r"env_args.pole_mass=true is not a number"):
+        tasks.of_config(preset("cartpole", settings={"env_args.pole_mass": True}))
 
 
 @pytest.mark.parametrize(

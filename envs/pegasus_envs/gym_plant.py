@@ -16,6 +16,7 @@ from gymnasium.envs.registration import load_env_creator
 from pegasus_envs.plant import filled
 
 LARGEST = 1e15  # of a reading: squares of larger ones overflow single precision in a fit
+PYTHONS = {"True": "true", "False": "false", "None": "null"}  # for JSON: an environment is written in Python
 RESETS = 100  # from which the distribution of starts is estimated where it is not given
 
 
@@ -56,8 +57,8 @@ _opened: dict[tuple[str, tuple[str, ...]], gymnasium.Env] = {}
 def make_env(name: str, arguments: tuple[str, ...] = (), **more: Any) -> gymnasium.Env:
     """The environment that Gymnasium knows as `name`, opened once.
 
-    `arguments` are its constructor's, as `port=/dev/ttyACM0`: JSON on the right, or else text; `more` are others, if it
-    is not open yet. Raises what Gymnasium or the constructor raises.
+    `arguments` are its constructor's, as `port=/dev/ttyACM0`: JSON on the right, True, False or None, or else text;
+    `more` are others, if it is not open yet. Raises what Gymnasium or the constructor raises.
     """
     if (name, arguments) not in _opened:
         pairs = (argument.partition("=") for argument in arguments)
@@ -258,7 +259,7 @@ def observed(x: Any, states: int, names: Sequence[str] = ()) -> np.ndarray:
 
 def _value(text: str) -> Any:
     try:
-        return json.loads(text)
+        return json.loads(PYTHONS.get(text, text))
     except ValueError:
         return text
 

@@ -43,13 +43,14 @@ def preset(
     """The config of a command with these words: preset("cartpole") is that of `pegasus-train task=cartpole`.
 
     `model`, `policy`, `algorithm` and `effort` are the command's words. `settings` are its other ones, by name, each
-    with its text or its value: {"search.steps": 200, "explore.kind": "walk"}. Raises ConfigError as the command would,
-    in one line with the nearest choice.
+    with its text or its value: {"search.steps": 200, "explore.kind": "walk"}. An env_args.NAME is given as it is, "5"
+    as a text and a tuple as a list. Raises ConfigError as the command would, in one line with the nearest choice.
     """
     from pegasus_jax.runs import config_io
 
     said = {"preset": name, "model": model, "policy": policy, "algorithm": algorithm, "effort": effort}
-    return config_io.parse({word: value for word, value in said.items() if value is not None} | dict(settings or {}))
+    words = {word: value for word, value in said.items() if value is not None}
+    return config_io.parse(words | config_io.of_python(settings or {}))
 
 
 @brief

@@ -20,6 +20,7 @@ from pegasus_jax.runs.removed import refuse, today
 # Keys that select what a command begins with, and what they select from.
 NAMED: dict[str, Any] = {"task": TASKS, **WORDS}
 ONE_FOR_ALL = ("control_rate",)  # settings of numbers, or of one number for all
+ARGUMENTS = "env_args."  # NAME=VALUE of an environment's own
 FILES = ("data",)  # settings of files and patterns: one, or a list of them; * means something else in YAML
 
 
@@ -74,11 +75,32 @@ def parse(words: Mapping[str, Any], options: Sequence[str] = ()) -> Config:
 
 
 def _with_arguments(words: Mapping[str, Any]) -> dict[str, Any]:
-    """The words, with those of env_args.NAME=VALUE as one list."""
-    prefix = "env_args."
-    given = [f"{key.removeprefix(prefix)}={value}" for key, value in words.items() if key.startswith(prefix)]
-    rest = {key: value for key, value in words.items() if not key.startswith(prefix)}
-    return rest | ({"env_args": json.dumps(given)} if given else {})
+    """The words, with those of env_args.NAME=VALUE as one list; a value that is no text is there in JSON."""
+    texts = {key: text if isinstance(text, str) else _json(key, text) for key, text in words.items() if _argument(key)}
+    rest = {key: value for key, value in words.items() if not _argument(key)}
+    return rest | (
+        {"env_args": [f"{key.removeprefix(ARGUMENTS)}={text}" for key, text in texts.items()]} if texts else {}
+    )
+
+
+def of_python(words: Mapping[str, Any]) -> dict[str, Any]:
+    """The words of a Python program: what it gives an environment is what it gets, also the text "5"."""
+    return {key: _json(key, value) if _argument(key) else value for key, value in words.items()}
+
+
+def _argument(key: str) -> bool:
+    return key.startswith(ARGUMENTS)
+
+
+def _json(key: str, value: Any) -> str:
+    """A value as JSON. Raises ConfigError for one that no file of settings can hold."""
+    try:
+        return json.dumps(value, ensure_ascii=False, default=lambda array: array.tolist())
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ConfigError(
+            f"{key} is of type {type(value).__name__}, which a run's folder cannot keep; expected a number, a text,"
+            " True, False, None, or a list or a dict of these"
+        ) from error
 
 
 def without_random(words: Mapping[str, Any]) -> dict[str, Any]:

@@ -32,7 +32,7 @@ def _constants(arguments: Sequence[str], plant: Callable[..., "Plant"]) -> dict[
         if name not in (names := [*inspect.signature(plant).parameters]):
             raise ConfigError(f"env_args.{name} is no constant of the plant; {did_you_mean(name, names)}")
         try:
-            found[name] = float(value)
+            found[name] = float(value.strip('"'))  # a text, from Python
         except ValueError:
             raise ConfigError(f"env_args.{name}={value} is not a number; for example env_args.{name}=0.4") from None
         check_range(f"env_args.{name}", found[name], 0, math.inf, open_high=True)
