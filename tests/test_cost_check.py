@@ -2,13 +2,16 @@
 
 import sys
 
+import gymnasium
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pegasus_jax import start
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs as imagined
+from pegasus_jax.runs import check
 from pegasus_jax.tasks import cost_check, user_code
 from pegasus_jax.types import Cost
 
@@ -159,3 +162,41 @@ def test_probes_are_the_start_zero_and_all_around_the_circle_within_the_limits()
     assert free[:, 0].min() < -3
     assert free[-100:, 0].max() > 3
     assert np.array_equal(free, cost_check.probes(facts()))
+
+
+class Turning(gymnasium.Env):
+    """The cosine and the sine of an angle, and its rate."""
+
+    observation_space = gymnasium.spaces.Box(-9.0, 9.0, (3,))
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (1,))
+    dt = 0.1
+
+    def reset(self, *, seed=None, options=None):
+        return np.array([-1.0, 0.0, 0.0], np.float32), {}
+
+
+gymnasium.register("Turning-v0", Turning)
+TURNING = {"env": "Turning-v0", "horizon": 9, "start_mean": [-1, 0, 0], "circles": [[0, 1]]}
+BEYOND = {
+    "constraint": lambda x: x[3] - 8.0,
+    "stop": lambda x: jnp.abs(x[3]) > 8,
+    "prior": lambda x, u: x * x[3],
+}
+
+
+@pytest.mark.parametrize("name", BEYOND)
+def test_nothing_of_the_user_s_reads_beyond_the_observation(name):
+    """As no cost does: JAX would give the last entry."""
+    words = TURNING | {"cost": lambda x, u: 1 - jnp.exp(-(x[1] ** 2) - u[0] ** 2), name: BEYOND[name]}
+    with pytest.raises(
+        ConfigError, match=rf"{name}=.* reads entry 3 of an array of 3 at test_cost_check.py:\d+; x has 3"
+    ):
+        check.report(start.preset("gym", settings=words))
+
+
+@pytest.mark.parametrize(
+    ("name", "reads"), [("prior", lambda x, u: x + u[1]), ("explore.policy", jax.jit(lambda x: jnp.stack([x[7]])))]
+)
+def test_a_simulator_and_a_first_controller_read_what_there_is(name, reads):
+    with pytest.raises(ConfigError, match=rf"{name}=.* reads entry \d of an array of \d at test_cost_check.py"):
+        check.report(start.preset("cartpole", model="log_normal", settings={name: reads}))

@@ -112,10 +112,12 @@ def circles_found(given: Config, known: Config) -> list[str]:
 
 
 def stopping(config: Config, task: Task) -> None:
-    """Raises ConfigError unless the task's `stop` is one probability, and its episodes do not end where they start."""
+    """Raises ConfigError unless the task's `stop` is one probability of x, and no episode ends where it starts."""
     if task.stop is None:
         return
     what = f"stop={shown(config.stop)}"
+    states = len(task.state_names)
+    cost_check.within(task.stop, (states + len(task.memory.names),), states + len(task.circles), what)
     with user_code.blamed(what, task.stop):
         value = jnp.asarray(task.stop(jnp.asarray(task.start_mean, float)))
     if value.shape != ():

@@ -146,15 +146,28 @@ def scales(facts: Facts) -> np.ndarray:
 def _traced(cost: Callable[[Any], Any], facts: Facts, what: str) -> None:
     """Raises ConfigError unless JAX can trace the cost to one number, and it reads no entry that is not there."""
     size = len(facts.start_mean)
-    observed = size - len(facts.remembered) + len(facts.circles)
 
     def one(x: Any) -> Any:
         value = cost(x)
         _number(value, cost, what)
         return jnp.asarray(value)
 
-    with blamed(what, cost):
-        traced = jax.make_jaxpr(one)(jax.ShapeDtypeStruct((size,), jnp.zeros(()).dtype))
+    within(one, (size,), size - len(facts.remembered) + len(facts.circles), what, cost)
+
+
+def within(
+    function: Callable[..., Any],
+    sizes: Sequence[int],
+    observed: int,
+    what: str,
+    blame: Callable[..., Any] | None = None,
+) -> None:
+    """Raises ConfigError where a JAX function of vectors of these sizes reads an entry that is not there.
+
+    `observed` is how many the user's x has; `blame` is the user's function, where it is another one.
+    """
+    with blamed(what, blame or function):
+        traced = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct((n,), jnp.zeros(()).dtype) for n in sizes))
     for index, length, line in beyond(traced):
         raise ConfigError(
             f"{what} reads entry {index} of an array of {length}{_in(line)}; x has {observed}, 0 to {observed - 1}, and"

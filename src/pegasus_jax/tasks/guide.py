@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -11,7 +10,7 @@ from pegasus_jax.checks import ConfigError, names_code, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.task import Task
-from pegasus_jax.tasks import user_code
+from pegasus_jax.tasks import cost_check, user_code
 
 
 def of_config(config: Config, task: Task) -> Callable[[Any], Any] | None:
@@ -40,7 +39,7 @@ def check(config: Config, task: Task) -> None:
     with user_code.blamed(what, guide):
         u = np.asarray(guide(start), float)
         if task.environment is None:
-            jax.eval_shape(lambda x: jnp.asarray(guide(x), float), start)
+            cost_check.within(lambda x: jnp.asarray(guide(x), float), start.shape, len(start) + len(task.circles), what)
     controls = len(task.control_names)
     if u.shape != (controls,):
         raise ConfigError(f"{what} returns an array of shape {u.shape}; expected ({controls},), a number a control")

@@ -12,7 +12,7 @@ from pegasus_jax.config import MJCF, Config
 from pegasus_jax.math import circles
 from pegasus_jax.models.residual import Simulate
 from pegasus_jax.task import Task
-from pegasus_jax.tasks import user_code
+from pegasus_jax.tasks import cost_check, user_code
 from pegasus_jax.types import Array
 
 FILE = ".xml"
@@ -39,6 +39,8 @@ def of_config(config: Config, task: Task) -> Simulate | None:
     def simulate(x: Array, u: Array) -> Array:
         return circles.to_state(function(circles.to_observation(x, task.circles), u), task.circles)
 
+    states, controls = len(task.state_names), len(task.control_names)
+    cost_check.within(simulate, (states, controls), states + len(task.circles), what, function)
     return checked(what, simulate, task, function)
 
 
