@@ -16,10 +16,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from pegasus_jax.config import Config, Explore
 from pegasus_jax.runs import display as progress
 from pegasus_jax.runs.config_io import parse
 from pegasus_jax.runs.display import Clock, Display, announcement, best_line, duration, stopped, summary
 from pegasus_jax.runs.trials_table import PLAIN, spark
+from pegasus_jax.tasks import guide
 
 ROW: dict[str, Any] = {
     "trial": 7,
@@ -131,6 +133,13 @@ def test_a_trial_that_is_still_evaluated_has_its_line_before_the_next(monkeypatc
         display.trial([ROW | {"trial": 1}])
         time.sleep(0.4)
     assert [line.split("  ")[0].strip() for line in text.getvalue().splitlines()] == ["trial", "trial 2/3"]
+
+
+def test_a_first_controller_is_named() -> None:
+    line = summary([ROW | {"policy": 0, "random": True}], 15, exploring="explore.policy=robot:swing")
+    assert "episode of explore.policy=robot:swing: cost 0.375" in line
+    assert guide.exploring(Config(explore=Explore(policy="robot:swing"))) == "explore.policy=robot:swing"
+    assert guide.exploring(Config()) == "random controls"
 
 
 def test_the_best_policy_is_named() -> None:

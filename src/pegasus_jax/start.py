@@ -198,8 +198,7 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     Impossible settings and logs end here, before anything is written.
     """
     from pegasus_jax.assembly.experiments import build
-    from pegasus_jax.runs import first, restore
-    from pegasus_jax.runs.begin import checked
+    from pegasus_jax.runs import begin, first, restore
     from pegasus_jax.runs.check import RESETS, before_training, unsaid
     from pegasus_jax.runs.logged import read_config
     from pegasus_jax.tasks import resolve
@@ -213,8 +212,8 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     task = build(replace(first.loaded(config), seed=0), mesh).task
     resets = 1 if asked.config.start_mean else RESETS  # who says where episodes start has nobody reset a robot
     logs, notes = read_config(config, task)
-    notes = checked(config, task) + unsaid(asked.config, config, task) + before_training(config, task, resets) + notes
-    for note in notes:
+    said = begin.checked(config, task) + first.checked(config, task) + unsaid(asked.config, config, task)
+    for note in said + before_training(config, task, resets) + notes:
         print(f"note: {note}", file=sys.stderr)
     return config, logs
 

@@ -22,6 +22,7 @@ from pegasus_jax.report.tables import trajectories_csv, trials_csv
 from pegasus_jax.report.trajectories import fans, summary
 from pegasus_jax.runs import store
 from pegasus_jax.runs.display import duration
+from pegasus_jax.tasks import guide
 
 WIDTHS = ("policy.hidden", "policy.num_centers", "model.hidden")  # how large what was learned is
 
@@ -106,9 +107,10 @@ def trajectories(found: Look) -> str:
         " of the particles, the thin lines are some of them. The dotted lines are the limits of the controls."
         " Particles that fly far away from the episode leave the picture.</p>"
     )
+    explored, exploring = found.config.explore.trials, guide.exploring(found.config)
     folds = [
         fold(
-            summary(step, found.task, step.number <= found.config.explore.trials),
+            summary(step, found.task, exploring if step.number <= explored else "first policy"),
             fans(step, found.task),
             name=f"trial-{step.number}",
             opened=step.number in (*newest, *of_best),

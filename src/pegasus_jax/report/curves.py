@@ -12,6 +12,7 @@ from pegasus_jax.report.page import number, table
 from pegasus_jax.report.read import Look
 from pegasus_jax.runs import store
 from pegasus_jax.runs.display import executed
+from pegasus_jax.tasks import guide
 
 HEAD = (  # of the table of trials
     "trial",
@@ -92,19 +93,21 @@ def _by_trial(values: Sequence[tuple[int, float]], style: str) -> Line:
 def trials(found: Look) -> str:
     """A row a trial."""
     covered = {step.number: read.coverage(step, found.task) for step in found.steps}
-    rows = [_row(row, row["trial"] == found.best, covered) for row in found.rows]
+    words = guide.exploring(found.config)
+    rows = [_row(row, row["trial"] == found.best, covered, words) for row in found.rows]
     note = "<p>“policy” is the one that the trial ends with; its own episode was run by the policy before it.</p>"
     return note + table(HEAD, rows)
 
 
-def _row(row: dict[str, Any], best: bool, covered: dict[int, float | None]) -> list[str]:
+def _row(row: dict[str, Any], best: bool, covered: dict[int, float | None], exploring: str) -> list[str]:
     """The cells of a trial; it leads to its trajectories, where there are some."""
     trial, (spent, compiling) = row["trial"], store.computing(row)
     name = f'<a href="#trial-{trial}">{trial}</a>' if trial in covered else str(trial)
     return [
         f"{name} <b>best</b>" if best else name,
         f"{row['plant_seconds']:g}",
-        escape(executed([row]).removeprefix("episode ").removeprefix("of ").removeprefix("by the ") + early(row)),
+        escape(executed([row], exploring).removeprefix("episode ").removeprefix("of ").removeprefix("by the "))
+        + escape(early(row)),
         number(row.get("episode_cost")),
         number(row.get("mean_cost")),
         number(row.get("success_rate"), ".0%"),

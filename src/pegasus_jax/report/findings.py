@@ -53,7 +53,7 @@ def _measured(found: Look) -> Iterator[Finding]:
         means = "Costs before it are of another function: curves jump there, and no earlier policy can be the best one."
         yield Finding("note", f"the cost was changed before trial {since}", means)
     if found.rows and all(row.get("objective_fresh") is None for row in found.rows):
-        yield Finding("note", "no policy was learned yet", "Every episode so far was of random controls.")
+        yield Finding("note", "no policy was learned yet", "Every episode so far explored.")
 
 
 def _model(found: Look) -> Iterator[Finding]:

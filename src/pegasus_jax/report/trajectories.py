@@ -16,11 +16,11 @@ from pegasus_jax.task import Task
 THIN = 12  # particles that are drawn as lines
 
 
-def summary(step: Step, task: Task, random: bool) -> str:
-    """The line that opens a trial; `random` says of policy 0 that its controls were random."""
+def summary(step: Step, task: Task, first: str) -> str:
+    """The line that opens a trial; `first` is what ran where no policy of the run's did."""
     if step.real is None:
         return f'Trial {step.number} <span class="soft">imagined; no trial has run this policy yet</span>'
-    who = f"policy of trial {step.policy}" if step.policy else "random controls" if random else "first policy"
+    who = f"policy of trial {step.policy}" if step.policy else escape(first)
     cost = f"cost {mean_cost(step.real, task):.3f}" if len(step.real.trajectory.cost) else "no control period"
     share = read.coverage(step, task)
     inside = "nothing was imagined of it" if share is None else f"{share:.0%} of its states inside the 90 % band"

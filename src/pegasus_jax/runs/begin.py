@@ -1,9 +1,12 @@
 """What a run takes over from another one, `init=RUN`: copied into its folder before anything else is in it.
 
 RUN/init/config.yaml, run.json, checkpoints/NNNN    of the other run, which may then be deleted
+
+first.py copies the run of explore.policy= in the same way.
 """
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,7 @@ import numpy as np
 from pegasus_jax.checks import ConfigError, RunError, shown
 from pegasus_jax.config import Config, begins_with
 from pegasus_jax.experiment import Experiment
+from pegasus_jax.math.circles import entries
 from pegasus_jax.memory import seen_names
 from pegasus_jax.runs import checkpoint, config_io, logged, restore, store
 from pegasus_jax.task import Task
@@ -28,20 +32,24 @@ def source(init: str) -> tuple[Path, int]:
     trial = text if "@" in init else restore.BEST
     if trial not in (restore.LAST, restore.BEST) and not trial.isdecimal():
         raise ConfigError(f"init={init} names no trial: expected a number, best or last after @, as init=runs/sim@best")
+    return run, numbered(run, trial, f"init={init}")
+
+
+def numbered(run: Path, trial: str, what: str) -> int:
+    """The number of a run's trial, "last" and "best" too. Raises ConfigError, beginning with `what`, for no run."""
     try:
-        found = store.existing(run)
-        number = restore.best(found) if trial == restore.BEST else trial
-        return found, max(checkpoint.available(found), default=0) if number == restore.LAST else int(number)
+        number = restore.best(store.existing(run)) if trial == restore.BEST else trial
     except RunError as error:
-        raise ConfigError(f"init={init}: {error}") from error
+        raise ConfigError(f"{what}: {error}") from error
+    return max(checkpoint.available(run), default=0) if number == restore.LAST else int(number)
 
 
-def read(run: Path, trial: restore.Trial, init: str) -> tuple[Config, Experiment, RunState]:
-    """`restore.restored`, whose errors name the setting: the run's task is that of its folder, nothing is imported."""
+def read(run: Path, trial: restore.Trial, what: str) -> tuple[Config, Experiment, RunState]:
+    """`restore.restored`, whose errors begin with `what`: the run's task is that of its folder, nothing is imported."""
     try:
         return restore.restored(run, trial)
     except RunError as error:
-        raise ConfigError(f"init={init}: {error}") from error
+        raise ConfigError(f"{what}: {error}") from error
 
 
 def checked(config: Config, task: Task) -> list[str]:
@@ -49,21 +57,10 @@ def checked(config: Config, task: Task) -> list[str]:
     if config.init is None:
         return []
     run, trial = source(config.init)
-    old, other, _ = read(run, trial, config.init)
-    what, theirs, learned = f"init={config.init}", other.task, [one for one in config.init_parts if one != "data"]
-    for name, mine, its in (
-        ("states", len(task.state_names), len(theirs.state_names)),
-        ("controls", len(task.control_names), len(theirs.control_names)),
-    ):
-        if mine != its:
-            raise ConfigError(
-                f"{what} is of {theirs.name} with {its} {name}, and {task.name} has {mine}{remembered(old, config)}"
-            )
-    if tuple(task.angles) != tuple(theirs.angles):
-        raise ConfigError(
-            f"{what} is of {theirs.name} with angles={shown(list(theirs.angles))}, and {task.name} has"
-            f" angles={shown(list(task.angles))}"
-        )
+    what, learned = f"init={config.init}", [one for one in config.init_parts if one != "data"]
+    old, other, _ = read(run, trial, what)
+    theirs = other.task
+    suits(what, task, theirs, more=remembered(old, config))
     mine, its = (", ".join(seen_names(one)) for one in (task, theirs))
     if learned and len(seen_names(task)) != len(seen_names(theirs)):
         why = remembered(old, config) or "; say the same sensors., history= and control_rate= words in both runs"
@@ -85,6 +82,36 @@ def checked(config: Config, task: Task) -> list[str]:
     notes = [
         f"{what}: begins with {' and '.join(parts)} of {theirs.name}; {first} (explore.trials={config.explore.trials})"
     ]
+    return [*notes, *otherwise(task, theirs)]
+
+
+def suits(what: str, task: Task, theirs: Task, observed: bool = False, more: str = "") -> None:
+    """Raises ConfigError where another run's policy cannot act on a task: other numbers, or other angles.
+
+    With `observed` it is given the observation, whose pairs of a cosine and a sine may be angles to one run only.
+    """
+
+    def size(one: Task) -> int:
+        return len(one.state_names) + observed * len(one.circles)
+
+    def angles(one: Task) -> list[int]:
+        places = entries(size(one), one.circles) if observed else range(size(one))
+        pairs = {min(pair) for pair in one.circles} if observed else set()
+        return [places[i] for i in one.angles if places[i] not in pairs]
+
+    words: tuple[Callable[[Task], str], ...] = (
+        lambda one: f"{size(one)} states",
+        lambda one: f"{len(one.control_names)} controls",
+        lambda one: f"angles={shown(angles(one))}",
+    )
+    for its, mine in ((word(theirs), word(task)) for word in words):
+        if its != mine:
+            raise ConfigError(f"{what} is of {theirs.name} with {its}, and {task.name} has {mine}{more}")
+
+
+def otherwise(task: Task, theirs: Task) -> list[str]:
+    """Notes on what is different in the task of another run, whose policy acts all the same."""
+    notes = []
     for name in ("dt", "control_low", "control_high"):
         mine, its = (np.asarray(getattr(one, name), float) for one in (task, theirs))
         if not np.allclose(mine, its):
@@ -103,16 +130,19 @@ def remembered(old: Config, config: Config) -> str:
 
 def copy(config: Config, run: Path) -> None:
     """Copy what the config's init= names into a new run's folder, which has no config.yaml yet."""
-    if config.init is None:
-        return
-    old, trial = source(config.init)
-    shutil.rmtree(run / FOLDER, ignore_errors=True)  # of a command that was killed before it began
-    (run / FOLDER / "checkpoints").mkdir(parents=True)
+    if config.init is not None:
+        copied(*source(config.init), run / FOLDER)
+
+
+def copied(old: Path, trial: int, into: Path) -> None:
+    """Copy into a folder what is needed to restore a trial of another run."""
+    shutil.rmtree(into, ignore_errors=True)  # of a command that was killed before it began
+    (into / "checkpoints").mkdir(parents=True)
     for name in ("config.yaml", "run.json", f"checkpoints/{trial:04d}.json"):
-        shutil.copyfile(old / name, run / FOLDER / name)
+        shutil.copyfile(old / name, into / name)
     for folder in (f"checkpoints/{trial:04d}", logged.FOLDER):  # logs say how much room its data have
         if (old / folder).is_dir():
-            shutil.copytree(old / folder, run / FOLDER / folder)
+            shutil.copytree(old / folder, into / folder)
 
 
 def begun(states: RunState, config: Config, run: Path | None = None) -> RunState:
@@ -123,7 +153,7 @@ def begun(states: RunState, config: Config, run: Path | None = None) -> RunState
     if config.init is None:
         return states
     found = (run / FOLDER, restore.LAST) if run is not None else source(config.init)
-    return taken_over(states, read(*found, config.init)[2], config.init_parts)
+    return taken_over(states, read(*found, f"init={config.init}")[2], config.init_parts)
 
 
 def taken_over(states: RunState, old: RunState, parts: tuple[str, ...]) -> RunState:

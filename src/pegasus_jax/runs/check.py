@@ -204,7 +204,7 @@ def report(config: Config) -> list[str]:
     asked, config = config, tasks.resolve(config)
     task = build(replace(first.loaded(config), seed=0)).task
     logs = read_config(config, task)[1]
-    notes = begin.checked(config, task) + unsaid(asked, config, task)
+    notes = begin.checked(config, task) + first.checked(config, task) + unsaid(asked, config, task)
     notes += before_training(config, task, 1 if given else RESETS) + logs
     wide = width(config, begun := at_starts(task))
     facts: dict[str, Any] = {

@@ -55,6 +55,7 @@ class Display:
     def __init__(self, trials: int, console: Console | None = None, quiet: bool = False) -> None:
         self.console = console or Console(file=sys.stderr, highlight=False, quiet=quiet)
         self.trials = trials
+        self.exploring = "random controls"  # what drives the first episodes
         self.asks = False  # whether an episode may speak with a person, as a robot's reset does: the table makes room
         self.done: list[Sequence[dict[str, Any]]] = []  # the rows of each finished trial, one a seed
         self.first = 1  # the trial of the first policy that is kept: 0 where one is before the first episode
@@ -117,7 +118,7 @@ class Display:
         self.done.append(rows)
         if not self.console.is_terminal:
             number = best(self.done, self.first) if len(rows) == 1 else None
-            self.line(summary(rows, self.trials, number))
+            self.line(summary(rows, self.trials, number, self.exploring))
         elif note := "  ".join(filter(None, (limits(rows), skipped(rows)))):
             self.line(f"trial {rows[0]['trial']}: {note}")
 
@@ -234,10 +235,12 @@ def stopped(home: Path) -> str:
     return f"stopped; all rows of every episode are kept, {typed(['pegasus-train', f'resume={home}'])} goes on"
 
 
-def summary(rows: Sequence[dict[str, Any]], trials: int, best: int | None = None) -> str:
+def summary(
+    rows: Sequence[dict[str, Any]], trials: int, best: int | None = None, exploring: str = "random controls"
+) -> str:
     """A trial in one line, from the row of each seed; of several seeds the means, and the median of the errors.
 
-    `best` is the trial with the best policy so far, if that is known.
+    `best` is the trial with the best policy so far, if that is known; `exploring` drives the first episodes.
     """
     first, several = rows[0], len(rows) > 1
     measured = first["mean_cost"] is not None
@@ -245,7 +248,7 @@ def summary(rows: Sequence[dict[str, Any]], trials: int, best: int | None = None
     parts = [
         f"trial {first['trial']:>2}/{trials}",
         f"{first['plant_seconds']:.1f} s of plant",
-        f"{executed(rows)}: cost {_mean(rows, 'episode_cost'):.3f}{outcome(rows)}",
+        f"{executed(rows, exploring)}: cost {_mean(rows, 'episode_cost'):.3f}{outcome(rows)}",
         learned(rows),
         "" if best in (None, first["trial"], judged(first)) else f"best so far: trial {best}",
         f"{count_solved(rows)} of {len(rows)} seeds solved" if measured and several else "",
@@ -271,13 +274,13 @@ def waited(seconds: dict[str, float]) -> str:
     return f"{between:.1f} s until the next episode{compiling}"
 
 
-def executed(rows: Sequence[dict[str, Any]]) -> str:
+def executed(rows: Sequence[dict[str, Any]], exploring: str) -> str:
     """Whose episode a trial's was: `policy` is the trial that learned the executed policy, 0 for what came before."""
     if "logs" in rows[0]:
         return f"{rows[0]['logs']} episodes of logs, {rows[0]['log_seconds']:g} s"
     policies = {row.get("policy", 0 if row["random"] else row["trial"] - 1) for row in rows}
     if policies == {0}:
-        return f"episode of {'random controls' if rows[0]['random'] else 'the first policy'}"
+        return f"episode of {exploring if rows[0]['random'] else 'the first policy'}"
     return f"episode by the policy of trial {policies.pop()}" if len(policies) == 1 else "episodes"
 
 
@@ -333,7 +336,7 @@ def limits_line(rows: Sequence[dict[str, Any]]) -> str:
 def best_line(rows: Sequence[dict[str, Any]], trial: int) -> str:
     """The trial with the best policy of a run, and what its evaluation, or else its own episodes, say of it."""
     if all(row["objective_fresh"] is None for row in rows):
-        return "no policy was learned: every episode was of random controls"
+        return "no policy was learned: every episode explored"
     row = rows[trial - 1] if trial else {"mean_cost": None}  # 0: the policy that the first episode ran
     own = [other["episode_cost"] for other in rows if other.get("policy") == trial and (trial or ran_first(other))]
     if row["mean_cost"] is not None:

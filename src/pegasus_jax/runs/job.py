@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -21,6 +22,7 @@ from pegasus_jax.runs.display import Display
 from pegasus_jax.runs.logged import NONE, Logs
 from pegasus_jax.runs.programs import Program, is_main_process
 from pegasus_jax.runs.writers import Writer
+from pegasus_jax.tasks import guide
 from pegasus_jax.types import Cost, RunState
 
 
@@ -37,23 +39,27 @@ class Job(NamedTuple):
     cost_since: Sequence[int] = ()  # of each seed, where its user has changed the cost: the first trial with today's
 
     def random(self, trial: int) -> bool:
-        """Whether the episode of this trial is of random controls."""
+        """Whether the episode of this trial explores: by random controls, or a controller of its user's."""
         return trial <= self.config.explore.trials
 
 
 @contextmanager
-def opened(config: Config, seeds: Sequence[int], mesh: Mesh | None = None, logs: Logs = NONE) -> Iterator[Job]:
+def opened(
+    config: Config, seeds: Sequence[int], mesh: Mesh | None = None, logs: Logs = NONE, run: Path | None = None
+) -> Iterator[Job]:
     """A job whose display is up and whose environment is closed afterwards. It writes nothing until told where.
 
-    JAX has the config's precision from here on.
+    Its first controller is the one that `run`, a folder of its own, has a copy of. JAX has the config's precision from
+    here on.
     """
     set_precision(config)
-    loaded = first.loaded(config)
+    loaded = first.loaded(config, run)
     experiment = build(replace(loaded, seed=0), mesh, logs.rows)  # the seed is in the key: all share one program
     try:
         kept = traced.store(config, len(seeds), alone=mesh is None)
         program = Program(experiment, config.search.steps, len(seeds), mesh, traced=kept)
         display = Display(config.trials, quiet=not is_main_process())
+        display.exploring = guide.exploring(config)
         display.asks = experiment.task.environment is not None
         with display.running():
             program.on_compile = display.compiling

@@ -21,7 +21,7 @@ from pegasus_jax.experiment import EVALUATE, trial_keys
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.logs.read import Logged
-from pegasus_jax.runs import begin, checkpoint, config_io, logged, restore, store, tracked, writers
+from pegasus_jax.runs import begin, checkpoint, config_io, first, logged, restore, store, tracked, writers
 from pegasus_jax.runs.beside import beside
 from pegasus_jax.runs.collect import collected, costs_since, stacked
 from pegasus_jax.runs.display import learned
@@ -87,11 +87,13 @@ def train_seeds(
             store.remove_unfinished(run)
             if not resume:
                 begin.copy(config, run)
+                first.copy(config, run)
+        multihost_utils.sync_global_devices("what is begun with is copied")
         before = config_io.load(folders[0] / "config.yaml") if resume else config
         store.enough(config.trials, max([0, *(trial for run in folders for trial in checkpoint.available(run))]))
         begun = logged.of_run(config, folders[0]) if resume else logged.of_config(config, logs)
         closing = held.enter_context(ExitStack())  # of what may wait for a network: a robot is let go before
-        job = held.enter_context(opened(config, list(runs), mesh, begun))
+        job = held.enter_context(opened(config, list(runs), mesh, begun, folders[0]))
         task, say = job.experiment.task, job.display.line
         for run in folders if begun.rows and not resume and is_main_process() else ():
             logged.save(run, begun.episodes(), task)

@@ -27,6 +27,12 @@ def is_folder(name: str | Callable[..., Any] | None) -> bool:
     return isinstance(name, str) and not names_code(name)
 
 
+def exploring(config: Config) -> str:
+    """What drives the first episodes, in words."""
+    name = config.explore.policy
+    return "random controls" if name is None else f"explore.policy={shown(name)}"
+
+
 def check(config: Config, task: Task) -> None:
     """Raises ConfigError unless the task's first controller gives one finite number a control at the start.
 
