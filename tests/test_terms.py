@@ -226,7 +226,8 @@ def test_a_file_is_a_line_between_its_rows_and_holds_its_ends(tmp_path):
     (tmp_path / "named.csv").write_text("t,a,b\n0,1,10\n1,3,10\n2,3,-10\n")
     (tmp_path / "bare.csv").write_text("0,1,10\n1,3,10\n2,3,-10\n\n")
     np.savez(tmp_path / "arrays.npz", t=[0.0, 1, 2], values=[[1.0, 10], [3, 10], [3, -10]])
-    for name in ("named.csv", "bare.csv", "arrays.npz"):
+    (tmp_path / "of a spreadsheet.csv").write_text("0,1,10\n1,3,10\n2,3,-10\n", encoding="utf-8-sig")
+    for name in ("named.csv", "bare.csv", "arrays.npz", "of a spreadsheet.csv"):
         value = signals.reference_of(str(tmp_path / name))
         for t, expected in ((-1, [1, 10]), (0.25, [1.5, 10]), (1.5, [3, 0]), (9, [3, -10])):
             np.testing.assert_allclose(value(jnp.asarray(float(t))), expected, rtol=1e-6)
@@ -239,6 +240,11 @@ def test_a_file_is_a_line_between_its_rows_and_holds_its_ends(tmp_path):
         ("alone.csv", "t\n0\n1\n", r"no values beside the times \[s\]"),
         ("empty.csv", "t,a\n", "no values"),
         ("words.csv", "t,a\n0,1\n1,up\n", "cannot be read as times and values: could not convert string to float"),
+        (
+            "slip.csv",
+            "O.5,5\n1,3\n2,3\n",
+            "cannot be read as times and values: could not convert string to float: 'O.5'",
+        ),
         ("nan.csv", "0,1\n1,nan\n", "has nan in row 2"),
         ("ragged.csv", "0,1\n1,1,2\n", "cannot be read as times and values"),
     ],

@@ -121,13 +121,18 @@ def read(file: Path, what: str) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _csv(file: Path) -> np.ndarray:
-    """The numbers of a file with commas, under a line of names or none."""
-    lines = [line for line in file.read_text(encoding="utf-8").splitlines() if line.strip()]
+    """The numbers of a file with commas, under a line of names or none: one number in it, and it is none of names."""
+    lines = [line.split(",") for line in file.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+    named = lines and not any(map(_is_number, lines[0]))
+    return np.array([[float(word) for word in line] for line in lines[bool(named) :]], ndmin=2)
+
+
+def _is_number(word: str) -> bool:
     try:
-        _ = [float(word) for word in lines[0].split(",")] if lines else []
+        float(word)
     except ValueError:
-        lines = lines[1:]
-    return np.array([[float(word) for word in line.split(",")] for line in lines], ndmin=2)
+        return False
+    return True
 
 
 def _npz(file: Path) -> np.ndarray:
