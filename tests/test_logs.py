@@ -149,9 +149,10 @@ def test_an_angle_is_interpolated_over_its_seam(low, tmp_path):
     np.testing.assert_allclose(np.abs(np.exp(1j * off) - 1), 0, atol=1e-5)
 
 
-def test_what_is_missing_cuts_an_episode_and_is_said(tmp_path):
+@pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
+def test_what_is_missing_cuts_an_episode_and_is_said(lost, tmp_path):
     rows = np.column_stack([0.3 * np.arange(12), np.linspace(0, 1, 12), np.ones(12), np.zeros(12)])
-    rows[3, 2] = np.nan  # line 5: of the observation
+    rows[3, 2] = lost  # line 5: of the observation
     rows[6, 3] = np.nan  # line 8: of the control
     rows[9:, 0] += 3  # line 11 comes late
     (x, u, after), notes = transitions(CART, written(tmp_path / "a.csv", "t,x,v,u", rows))
@@ -204,6 +205,13 @@ def test_a_map_that_cannot_be_is_refused(columns, part, tmp_path):
     (tmp_path / "a.csv").write_text(GOOD)
     with pytest.raises(ConfigError, match=part.replace("*", r"\*")):
         read([str(tmp_path / "a.csv")], CART, columns)
+
+
+def test_an_angle_that_a_log_lacks_is_not_in_degrees(tmp_path):
+    (tmp_path / "a.csv").write_text("angle,turn\n0.1,0\n0.2,0\ninf,0\n0.3,0\n0.4,0\n")
+    (first, second), notes = read([str(tmp_path / "a.csv")], DIAL)
+    assert (len(first.trajectory.u), len(second.trajectory.u)) == (1, 1)
+    assert "line 4 lacks a number of the observation" in " ".join(notes)
 
 
 @pytest.mark.parametrize("degrees", [[170.0, 160, 150], [5.0, 20, 35, 55]])

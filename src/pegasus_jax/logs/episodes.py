@@ -107,7 +107,7 @@ def _radians(table: Table, rows: np.ndarray, observed: np.ndarray, where: Layout
                 f" squares is {radius[row]:.3g}"
             )
     for entry in np.flatnonzero(names_of(task).turning):
-        angle = observed[:, entry]
+        angle = np.where(np.isfinite(observed[:, entry]), observed[:, entry], np.nan)  # else the episode is cut there
         jumps = np.abs(np.diff(angle))
         odd = (jumps > np.pi) & (np.abs(jumps - 2 * np.pi) > np.pi / 2)  # neither a move nor a seam at 180 degrees
         odd &= np.abs(angle[1:]) > TURNS
