@@ -154,6 +154,29 @@ def test_what_will_be_sent_is_said(low: float, high: float, amplitude: float, ex
     assert {f"{u:.4g}" for u in Motor.sent} == {*expected.split(" or "), str(rest)}
 
 
+class Steps(Motor):
+    """The same, of whole volts."""
+
+    def __init__(self, **options: Any):
+        super().__init__(**options)
+        self.action_space = gymnasium.spaces.Box(-2, 2, (1,), np.int32)
+
+
+gymnasium.register("Steps-v0", Steps)
+
+
+def test_whole_numbers_are_said_as_they_are_sent() -> None:
+    plan = planned(config(env="Steps-v0"), 0.7, 100)
+    assert announced(plan).startswith("Steps-v0: sends voltage [V] of -1 or 1, by a new draw")
+    measure(plan)
+    assert {*Motor.sent} == {-1.0, 0.0, 1.0}
+    with pytest.raises(ConfigError) as refused:
+        planned(config(env="Steps-v0"), 0.2, 100)
+    nearest = float(str(refused.value).rpartition("amplitude=")[2])
+    assert "amplitude=0.2 is too small for whole numbers: voltage [V] of 0 only; type" in str(refused.value)
+    assert np.ptp(planned(config(env="Steps-v0"), nearest, 100).sent) > 0
+
+
 def test_a_limit_on_the_rate_of_change_is_said_and_how_to_lift_it() -> None:
     """From one limit of the range, rest, a control may go as far as from one value to the other."""
     for low, expected, moves in ((0, "0 or 0.2", 2.0), (-5, "-0.1 or 0.1", 8.0)):

@@ -50,19 +50,33 @@ def planned(config: Config, amplitude: float = AMPLITUDE, periods: int = 200, mo
 
     Each control is, in each period by a new draw, one of two values: `amplitude` of half the control range above or
     below rest, which is 0 or the limit next to it, and within the range. Where the controls' rate of change is limited,
-    both are drawn in towards rest until one may follow the other. Raises ConfigError for what cannot be.
+    both are drawn in towards rest until one may follow the other; whole numbers are rounded. Raises ConfigError for
+    what cannot be.
     """
     check_range("amplitude", amplitude, 0, 1, open_low=True)
     check_range("most", most, 1, 100)
     task = _of_environment(config)
     check_range("periods", periods, most + enough(len(task.control_names), most), ALL)
     check_range("horizon", task.horizon, most + 1)
+    whole = np.issubdtype(tasks.environment(config).action_space.dtype, np.integer)
+    asked, sent = controls_of(task, amplitude, whole)
+    for i in np.flatnonzero(np.ptp(sent, axis=0) == 0)[:1]:
+        moving = [a / 20 for a in range(1, 21) if np.ptp(controls_of(task, a / 20, whole)[1], axis=0).all()]
+        raise ConfigError(
+            f"amplitude={amplitude:g} is too small for whole numbers: {task.control_names[i]} of {sent[0, i]:g} only; "
+            + (f"type amplitude={moving[0]:g}" if moving else "no amplitude up to 1 is enough")
+        )
+    return Plan(config, task, asked, sent, amplitude, periods, most)
+
+
+def controls_of(task: Task, amplitude: float, whole: bool) -> tuple[np.ndarray, np.ndarray]:
+    """`asked` and `sent` [2, U] of a plan; of whole numbers as an environment rounds them."""
     low, high, rest = np.asarray(task.control_low), np.asarray(task.control_high), resting(task)
     asked = np.clip(rest + np.outer([-1, 1], amplitude * (high - low) / 2), low, high)
     allowed = largest_change(task) / np.ptp(asked, axis=0)
     # What is less than rounding is no limit.
     sent = np.where(allowed < 1 - 1e-6, rest + np.minimum(allowed, 1.0) * (asked - rest), asked)
-    return Plan(config, task, asked, sent, amplitude, periods, most)
+    return (np.rint(asked) + 0.0, np.rint(sent) + 0.0) if whole else (asked, sent)  # and no -0
 
 
 def measure(plan: Plan) -> Measured:
