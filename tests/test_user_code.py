@@ -1,6 +1,7 @@
 """What is wrong with a user's own code is one line with their file and line; code in a run's folder is not run."""
 
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -120,3 +121,11 @@ def test_no_folder_is_added_twice(here):
         user_code.load("cost", "own_costs:cost")
     assert sys.path.count(os.getcwd()) == 1
     assert Path(os.getcwd()) == here
+
+
+@pytest.mark.parametrize(
+    ("setting", "word"), [("cost", "cost=function"), ("explore.policy", 'settings={"explore.policy": function}')]
+)
+def test_a_function_of_a_program_is_given_again_as_it_can_be(setting, word):
+    with pytest.raises(ConfigError, match=re.escape(f"go on in Python: train(resume=RUN, {word})")):
+        user_code.load(setting, "__main__:<lambda>")

@@ -33,9 +33,10 @@ def load(setting: str, name: str | Callable[..., Any], not_from: Path | None = N
     module, _, function = name.partition(":")
     what = f"{setting}={name}"
     if module == "__main__" or "<" in function:
+        again = "cost=function" if setting == "cost" else f'settings={{"{setting}": function}}'
         raise ConfigError(
             f"{what} is a function of the Python program that began the run, which no other can import; define it in a"
-            " module of its own, or go on in Python: train(resume=RUN, cost=function)"
+            f" module of its own, or go on in Python: train(resume=RUN, {again})"
         )
     if not (module and function):
         raise ConfigError(f"{what} cannot be imported: expected {setting}=module:function, as in {setting}=robot:cost")
