@@ -13,7 +13,7 @@ import pegasus_jax as pg
 from benchmarks.robot import cartpole_by_hand
 from folders import TINY, a_run
 from pegasus_envs.cartpole import cartpole
-from pegasus_jax import build, compose, tasks
+from pegasus_jax import build, compose, memory, tasks
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import begins_with, first_search
 from pegasus_jax.learn import data as dataset
@@ -22,10 +22,12 @@ from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.models.residual import FURTHEST, differences, on_differences, residual
 from pegasus_jax.runs import begin, check, checkpoint, config_io, logged, restore, store
 from pegasus_jax.runs.train import train
+from pegasus_jax.tasks.remembered import remembering
 from pegasus_jax.types import Batch, ModelLearner
 from pegasus_jax.vectorized import for_particles
 from probes import cart, experience, network, regression, same, tiny
 
+NETWORK = {"preset": "cartpole_network", "search__particles": "20"}
 SMALL = {"fit.steps": "2", "eval_episodes": "0", "trials": "1"}
 
 
@@ -235,6 +237,30 @@ def test_what_a_run_begins_with_is_said_and_copied(simulator, tmp_path):
     both = begin.taken_over(fresh, old, ("policy", "model"))
     assert same(both.model.params, jax.tree.map(lambda leaf: leaf[None], old.model.params))
     assert begin.source(str(simulator)) == (simulator, restore.best(simulator))
+
+
+def test_a_policy_that_sees_something_else_is_no_beginning(tmp_path):
+    """Also where it is as many numbers: a force of before is no goal. What a user calls his states is of no matter."""
+    limited = a_run(tmp_path / "limited", control_rate="50", **NETWORK)
+    words = dict(cost=lambda x, goal: x[0] ** 2 + goal[0], goal_low="[-1]", goal_high="[1]", **NETWORK)
+    with pytest.raises(
+        ConfigError, match=r"sees .*force \[N\] 1 before, and here .*goal 0; that run has control_rate=\[50\]"
+    ):
+        check.report(parse(init=str(limited), **words))
+    for given in (
+        dict(control_rate="50"),
+        dict(history="3"),
+        {"sensors.measured": "[0,3]", "sensors.velocity": "filter"},
+    ):
+        task = build(parse(**NETWORK, **given)).task
+        names = {name: f"{name} renamed" for name in (*task.state_names, *task.control_names)}
+        renamed = tasks.of_config(parse(**NETWORK, **given))._replace(
+            state_names=tuple(map(names.get, task.state_names)), control_names=tuple(map(names.get, task.control_names))
+        )
+        other = remembering(parse(**NETWORK, **given), renamed)
+        assert other.memory.shown != task.memory.shown
+        assert memory.seen_kinds(other) == memory.seen_kinds(task)
+        assert len({*memory.seen_kinds(task)}) == len(memory.seen_names(task))
 
 
 def said(words):

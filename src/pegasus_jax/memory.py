@@ -6,6 +6,7 @@ observation and the control in. The same functions run in imagination, on a plan
 exported controller.
 """
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pegasus_jax.math.units import rate_of
 from pegasus_jax.task import Task
 from pegasus_jax.types import NO_MEMORY, Array, Key, Memory, Trajectory
 
@@ -148,6 +150,22 @@ def units(memory: Memory) -> tuple[float, ...]:
 def seen_names(task: Task) -> tuple[str, ...]:
     """Names of what the policy sees [P]."""
     return (*(task.state_names[i] for i in measured(task)), *task.memory.shown)
+
+
+def seen_kinds(task: Task) -> tuple[str, ...]:
+    """What the policy sees [P], by places in state and control instead of their names, which are a user's."""
+    places = {f"measured {rate_of(name)}": f"rate {i}" for i, name in enumerate(task.state_names)}
+    named = [
+        (name, f"{what} {i}") for what in ("state", "control") for i, name in enumerate(getattr(task, f"{what}_names"))
+    ]
+
+    def kind(shown: str) -> str:
+        for name, place in named:
+            if re.fullmatch(rf"{re.escape(name)} \d+ before", shown):
+                return place + shown.removeprefix(name)
+        return places.get(shown, shown.partition(" in ")[0])  # a reference's time follows from dt, which may differ
+
+    return (*(f"state {i}" for i in measured(task)), *map(kind, task.memory.shown))
 
 
 def seen_angles(task: Task) -> tuple[int, ...]:

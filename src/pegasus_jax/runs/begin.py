@@ -18,7 +18,7 @@ from pegasus_jax.checks import ConfigError, RunError, shown
 from pegasus_jax.config import Config, begins_with
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.math.circles import entries
-from pegasus_jax.memory import seen_names
+from pegasus_jax.memory import seen_kinds, seen_names
 from pegasus_jax.runs import checkpoint, config_io, logged, restore, store
 from pegasus_jax.task import Task
 from pegasus_jax.types import RunState, TrainState
@@ -62,8 +62,11 @@ def checked(config: Config, task: Task) -> list[str]:
     theirs = other.task
     suits(what, task, theirs, more=remembered(old, config))
     mine, its = (", ".join(seen_names(one)) for one in (task, theirs))
-    if learned and len(seen_names(task)) != len(seen_names(theirs)):
-        why = remembered(old, config) or "; say the same sensors., history= and control_rate= words in both runs"
+    if learned and seen_kinds(task) != seen_kinds(theirs):
+        why = remembered(old, config) or (
+            "; say the same sensors., history= and control_rate= words in both runs, with a cost= of as many of u,"
+            " previous_u, t, reference and goal"
+        )
         raise ConfigError(f"{what} has a policy that sees {its}, and here it would see {mine}{why}")
     for part in learned:  # data are checked as logs are
         its, mine = (config_io.leaves(getattr(one, part), f"{part}.") for one in (old, config))
