@@ -21,6 +21,7 @@ import pytest
 
 import pegasus_jax as pg
 from folders import a_run
+from pegasus_jax.config import Explore, Sensors
 from probes import unchecked
 
 _counter = itertools.count()
@@ -793,25 +794,50 @@ def loaded(code: str) -> set[str]:
     return set(done.stdout.split())
 
 
+SENSORS = (
+    {"sensors.measured": [0, 3], "sensors.velocity": "difference", "sensors.delay": 2},
+    {"sensors.measured": [0, 1, 3], "history": 2},
+)
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
         (
             dict(horizon=7),
-            r"the Config has a horizon, and the task .* has 5, which .*task\._replace\(horizon=",
+            r"the Config has horizon=, and the task .* has horizon=5, which .*task\._replace\(horizon=",
         ),
-        (dict(dt=0.4), r"the Config has a dt"),
-        (dict(stop=lambda x: x[0] > 1), r"the Config has a stop, and the task .* has null"),
-        (dict(constraint=lambda x: x[0] - 1), r"the Config has a constraint"),
-        (dict(goal_low=(-1.0,), goal_high=(1.0,)), r"the Config has a goal"),
-        (dict(reference=lambda t: t), r"the Config has a reference"),
+        (dict(dt=0.4), r"the Config has dt="),
+        (dict(stop=lambda x: x[0] > 1), r"the Config has stop=, and the task .* has stop=null"),
+        (dict(constraint=lambda x: x[0] - 1), r"the Config has constraint="),
+        (dict(goal_low=(-1.0,), goal_high=(1.0,)), r"the Config has goals=, and the task .* has goal=null"),
+        (dict(reference=lambda t: t), r"the Config has reference="),
+        (dict(explore=Explore(policy=lambda x: x)), r"the Config has explore\.policy=, and the task .* has guide=null"),
+        (dict(sensors=Sensors(measured=(0,))), r"the Config has sensors\.measured=, and the task .* has state_names="),
+        (dict(sensors=Sensors(delay=2)), r"the Config has sensors\.delay=, and the task .* has late=0"),
+        (
+            dict(sensors=Sensors(velocity="filter")),
+            r"the Config has sensors\.velocity=, and the task .* has rates=\[\]",
+        ),
+        (dict(success=0.7), r"the Config has success=, and the task .* has success=0\.2"),
+        (dict(stop_cost=3.0), r"the Config has stop_cost=, and the task .* has stop_cost=1"),
+        (dict(circles=((0, 1),)), r"the Config has circles="),
+        (dict(rates=(1,)), r"the Config has rates="),
+        (dict(state_names=("a", "b")), r"the Config has state_names="),
+        (dict(control_names=("a",)), r"the Config has control_names="),
+        (dict(data=("a.csv",)), r"the Config has data=\[a\.csv\], and compose reads no files"),
+        (dict(init="run"), r"the Config has init=run, and compose reads no files"),
     ],
 )
 def test_a_setting_that_makes_another_task_is_not_dropped(settings: dict[str, Any], message: str) -> None:
-    task = TASK._replace(horizon=5)
+    task = TASK._replace(horizon=5, rates=())
     with pytest.raises(pg.ConfigError, match=f"^{message}"):
         pg.compose(replace(CONFIG, **settings), task)
     pg.compose(replace(CONFIG, horizon=5, dt=task.dt), task)
+    pg.compose(replace(CONFIG, sensors=Sensors(delay=2)), task._replace(late=2))
+    for words in SENSORS:
+        config = pg.preset("cartpole", model="log_normal", settings=words)
+        pg.compose(config, pg.tasks.of_config(config))
 
 
 def test_what_is_no_config_or_no_task_is_one_line() -> None:

@@ -227,7 +227,7 @@ def test_what_a_run_begins_with_is_said_and_copied(simulator, tmp_path):
     begin.copy(config, tmp_path / "new")
     begin.copy(config, tmp_path / "new")  # of a command that was killed before it began
     old = restore.restored(simulator, 2)[2]
-    fresh = jax.tree.map(lambda leaf: leaf[None], jax.jit(compose(config, task).init)(jax.random.key(5)))
+    fresh = jax.tree.map(lambda leaf: leaf[None], jax.jit(build(config).init)(jax.random.key(5)))
     for run in (tmp_path / "new", None):
         states = begin.begun(fresh, config, run)
         assert same(states.policy.params, jax.tree.map(lambda leaf: leaf[None], old.policy.params))

@@ -58,6 +58,8 @@ class Task(NamedTuple):
     control_rate: Any = None  # [U] the largest rate of change of each control [1/s]; None: any
     guide: Callable[[Any], Any] | None = None  # x [D] -> u [U], the controller of the first episodes; None: random
 
+    late: int = 0  # control periods that a control waits in `plant`, of which a controller has to remember them
+
     @property
     def may_end(self) -> bool:
         """Whether an episode may be shorter than the horizon."""

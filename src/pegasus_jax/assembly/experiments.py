@@ -79,8 +79,9 @@ def compose(
     configured. There is room for `logged` rows of data besides those of the trials. Controls of a policy of your
     own beyond the task's limits are cut off at them, in imagination as on the plant. With a `mesh` (sharding.py)
     the particles of a search are spread over its devices. Raises ConfigError for what is no piece, a task whose
-    fields do not agree, a horizon, dt, stop, constraint, prior, reference or goal of the config that the task has
-    not, and a piece that does not suit the config: moment matching, for example, needs more particles than states.
+    fields do not agree, a setting of what the task is that it is not, as another horizon, a constraint or sensors, and
+    a piece that does not suit the config: moment matching, for example, needs more particles than states. A plant of
+    your own that is late says so: `task._replace(late=2)` goes with `sensors.delay=2`.
     """
     _of_kinds(config=config, task=task, dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher)
     _agree(config, task)
@@ -90,20 +91,53 @@ def compose(
 
 def _agree(config: settings.Config, task: Task) -> None:
     """Raises ConfigError for a setting that says what the task is, where the task is otherwise."""
-    told: dict[str, Any] = {name: getattr(config, name) for name in ("stop", "constraint", "prior", "reference")}
-    told["goal"] = config.goals or config.goal_low or None
-    missing = [name for name, value in told.items() if value is not None and getattr(task, name) is None]
-    own = {name: getattr(task, name) for name in ("horizon", "dt")}
-    other = [
-        name
-        for name, value in own.items()
-        if not isinstance(value, Tracer) and getattr(config, name) not in (None, value)
-    ]
-    for name in [*missing, *other]:
+    for setting, value in {"data": config.data, "init": config.init}.items():
+        if value:
+            raise ConfigError(
+                f"the Config has {setting}={shown(value)}, and compose reads no files: leave it out of the Config;"
+                " train(config) begins with it, load_logs reads logs"
+            )
+    for setting, field in _otherwise(config, task):
         raise ConfigError(
-            f"the Config has a {name}, and the task {task.name} has {shown(getattr(task, name))}, which is what counts:"
-            f" leave it out of the Config; task._replace({name}=...) changes it, tasks.of_config(config) makes a task"
+            f"the Config has {setting}=, and the task {task.name} has {field}={shown(getattr(task, field))}, which is"
+            f" what counts: leave it out of the Config; task._replace({field}=...) changes it, tasks.of_config(config)"
+            " makes a task"
         )
+
+
+def _otherwise(config: settings.Config, task: Task) -> list[tuple[str, str]]:
+    """(setting, field of the task) wherever the config says one thing and the task is another."""
+    sensors, size, computed = config.sensors, len(task.state_names), config.sensors.velocity != "none"
+    given = {name: (name, getattr(config, name)) for name in ("stop", "constraint", "prior", "reference")}
+    given |= {
+        "goals": ("goal", config.goals or config.goal_low or None),
+        "explore.policy": ("guide", config.explore.policy),
+    }
+    lacks = [
+        (name, field) for name, (field, value) in given.items() if value is not None and getattr(task, field) is None
+    ]
+    entries = {  # of what is measured there may be none; an angle has the names of its cosine and its sine
+        **{
+            name: getattr(config, name) and not (getattr(task, name) or sensors.measured)
+            for name in ("circles", "rates")
+        },
+        "state_names": config.state_names and not any(name in str(task.state_names) for name in config.state_names),
+        "control_names": config.control_names not in ((), task.control_names),
+    }
+    known = {
+        ("sensors.measured", "state_names"): sensors.measured
+        and size != (len(sensors.measured) - len(task.circles)) * (1 + computed),
+        ("sensors.velocity", "rates"): computed and 2 * len(task.rates) != size,
+        ("sensors.delay", "late"): task.environment is None and sensors.delay not in (0, task.late),
+        **{(name, name): wrong for name, wrong in entries.items()},
+    }
+    numbers = {name: getattr(task, name) for name in ("horizon", "dt", "success", "stop_cost")}
+    others = [
+        (name, name)
+        for name, its in numbers.items()
+        if not isinstance(its, Tracer) and getattr(config, name) not in (getattr(settings.Config, name), its)
+    ]
+    return [*lacks, *(pair for pair, wrong in known.items() if wrong), *others]
 
 
 def assembled(config: settings.Config, task: Task, mesh: Mesh | None, logged: int, **pieces: Any) -> Experiment:

@@ -137,7 +137,7 @@ def delayed(task: Task, delay: int) -> Task:
     films = (
         {"substates": lambda state, u: plant.substates(state[0], state[1][0])} if "substates" in plant._fields else {}
     )
-    return task._replace(plant=late._replace(**films))
+    return task._replace(plant=late._replace(**films), late=delay)
 
 
 def chosen(task: Task, sensors: Sensors, circles: Circles) -> tuple[Task, Circles]:
