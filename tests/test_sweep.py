@@ -7,7 +7,9 @@ import subprocess
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -86,6 +88,10 @@ def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
         check(jobs[0])
 
 
+def beyond(x: Any) -> Any:
+    return 1 - jnp.exp(-(x[7] ** 2))
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -102,6 +108,10 @@ def test_seeds_alone_lie_as_those_of_one_study(tmp_path: Path) -> None:
         (["seeds=4", "mesh=3x1"], "mesh=3x1 cannot share 4 seeds evenly; mesh=1x1"),
         (["mesh=1x1,4"], "mesh=4 is not of the form SEEDSxPARTICLES"),
         (["track=none,wanb"], "track=wanb is unknown; did you mean 'wandb'"),
+        (["data=nowhere.csv", "seed=0-1"], r"data=nowhere\.csv: there is no such file"),
+        (["init=nowhere,null"], "init=nowhere: nowhere is not a run"),
+        (["explore.policy=nowhere"], r"explore\.policy=nowhere is neither a run's folder nor a function"),
+        ([f"cost={__name__}:beyond", "trials=1-2"], "reads entry 7 of an array of 4"),
         (["resume=runs/demo"], "resume is not a setting"),
         (["jobs=0"], "jobs=0 is out of range"),
         (["launcher=slrm"], "did you mean 'slurm'"),

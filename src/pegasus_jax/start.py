@@ -198,9 +198,7 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     Impossible settings and logs end here, before anything is written.
     """
     from pegasus_jax.assembly.experiments import build
-    from pegasus_jax.runs import begin, first, restore
-    from pegasus_jax.runs.check import RESETS, before_training, unsaid
-    from pegasus_jax.runs.logged import read_config
+    from pegasus_jax.runs import check, first, restore
     from pegasus_jax.tasks import resolve
 
     if asked.resumed is not None:
@@ -209,11 +207,8 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
         build(replace(config, seed=0), mesh)
         return config, None
     config = first.found(resolve(asked.config))
-    task = build(replace(first.loaded(config), seed=0), mesh).task
-    resets = 1 if asked.config.start_mean else RESETS  # who says where episodes start has nobody reset a robot
-    logs, notes = read_config(config, task)
-    said = begin.checked(config, task) + first.checked(config, task) + unsaid(asked.config, config, task)
-    for note in said + before_training(config, task, resets) + notes:
+    _, logs, notes = check.checked(asked.config, config, mesh)
+    for note in notes:
         print(f"note: {note}", file=sys.stderr)
     return config, logs
 

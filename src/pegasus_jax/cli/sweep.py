@@ -9,6 +9,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +17,7 @@ from pegasus_jax.checks import ConfigError, did_you_mean, whole
 from pegasus_jax.cli import train as cli_train
 from pegasus_jax.cli.main import main
 from pegasus_jax.cli.words import MORE
+from pegasus_jax.config import Config
 from pegasus_jax.shell import typed
 
 SWEEP = """\
@@ -131,17 +133,24 @@ def names_of(found: Sequence[str]) -> dict[str, str]:
 
 def check(job: Job) -> None:
     """Raise ConfigError for what pegasus-train would refuse, but for devices that only it asks for."""
-    from pegasus_jax import tasks
-    from pegasus_jax.assembly.experiments import build, set_precision
     from pegasus_jax.runs import config_io, store
 
     options, settings = config_io.split(job.words, ("out", *OF_TRAIN))
     asked = cli_train.new(options, settings, OPTIONS)
-    config = tasks.resolve(asked.config)
-    set_precision(config)
-    build(replace(config, seed=0))
+    _learnable(replace(asked.config, seed=0))
     if store.holds(job.run):
         raise ConfigError(f"{job.run} holds a run already; another out= keeps both")
+
+
+@cache
+def _learnable(config: Config) -> None:
+    """Raise ConfigError for what cannot be learned; looked at once for all seeds."""
+    from pegasus_jax import tasks
+    from pegasus_jax.assembly.experiments import set_precision
+    from pegasus_jax.runs.check import checked
+
+    set_precision(config)
+    checked(config, tasks.resolve(config))
 
 
 def show(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) -> None:

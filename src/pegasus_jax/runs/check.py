@@ -5,12 +5,15 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from pegasus_jax import tasks
+from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.assembly.schedules import at_starts, width_of
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config, Search, first_search
 from pegasus_jax.imagine import costs
+from pegasus_jax.logs.read import Logged
 from pegasus_jax.math.circles import entries
 from pegasus_jax.math.units import parted
 from pegasus_jax.memory import seen_names
@@ -23,6 +26,18 @@ from pegasus_jax.tasks import assumed, constrained, cost_check, guide, signals, 
 RESETS = 20  # of an environment that may be reset without need
 LONG = 600  # [s] of an episode from which on its period may be in other units
 EXACT = 1e-4  # of an entry's spread: what is left of it is rounding
+
+
+def checked(asked: Config, config: Config, mesh: Mesh | None = None) -> tuple[Task, list[Logged], list[str]]:
+    """The task of a new run's config, its logs, and what to say of them, one line each; `asked` is not resolved yet.
+
+    Raises ConfigError, in one line, for whatever cannot be learned: all that is known before the first episode.
+    """
+    task = build(replace(first.loaded(config), seed=0), mesh).task
+    resets = 1 if asked.start_mean else RESETS  # who says where episodes start has nobody reset a robot
+    logs, read = read_config(config, task)
+    said = begin.checked(config, task) + first.checked(config, task) + unsaid(asked, config, task)
+    return task, logs, said + before_training(config, task, resets) + read
 
 
 def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
@@ -197,15 +212,9 @@ def report(config: Config) -> list[str]:
 
     Raises ConfigError, in one line, for what cannot be learned.
     """
-    from pegasus_jax.assembly.experiments import build, set_precision
-
-    given = bool(config.start_mean)
     set_precision(config)
     asked, config = config, tasks.resolve(config)
-    task = build(replace(first.loaded(config), seed=0)).task
-    logs = read_config(config, task)[1]
-    notes = begin.checked(config, task) + first.checked(config, task) + unsaid(asked, config, task)
-    notes += before_training(config, task, 1 if given else RESETS) + logs
+    task, _, notes = checked(asked, config)
     wide = width(config, begun := at_starts(task))
     facts: dict[str, Any] = {
         "task": " ".join([config.task, *([task.name] if task.name != config.task else [])]),
