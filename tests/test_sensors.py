@@ -26,7 +26,7 @@ from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.math.units import rate_of
 from pegasus_jax.models.smoothed import alternating, corrected, draw_rates
 from pegasus_jax.policies.rate_limited import rate_limited
-from pegasus_jax.runs import config_io, facts
+from pegasus_jax.runs import check, config_io, facts
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.start import preset
 from pegasus_jax.tasks.remembered import remembering, smoothed
@@ -400,6 +400,23 @@ def test_no_rate_of_a_rate_is_computed_and_none_is_taken_for_another():
     assert "its rates was" in str(facts.difference(before, now))  # a pair once, and now not known to be one
     now, before = (facts.of_task(five([0, 1, 3])) | {"rates": rates} for rates in ([], [2]))
     assert facts.difference(before, now) is None
+
+
+def test_of_a_simulation_the_cost_gets_all_and_what_else_its_user_gives_what_is_measured():
+    """As docs/sensors.md says: a limit, or a controller, of what no sensor tells could not be kept, or be used."""
+    seen = {}
+
+    def saw(name, value):
+        return lambda x: seen.setdefault(name, set()).add(x.shape) or value(x)
+
+    given = {
+        "cost": saw("cost", lambda x: 1 - jnp.exp(-(x[0] ** 2) - x[3] ** 2)),
+        "constraint": saw("constraint", lambda x: jnp.abs(x[0]) - 9),
+        "explore.policy": saw("explore.policy", lambda x: x[:1]),
+    }
+    words = {"sensors.measured": [0, 2, 3], "history": 2, "search.particles": 20}
+    check.report(preset("cartpole", model="log_normal", settings=words | given))
+    assert seen == {"cost": {(4,)}, "constraint": {(3,)}, "explore.policy": {(3,)}}
 
 
 def squared(x):

@@ -72,7 +72,8 @@ def coordinates(task: Task) -> list[int]:
 def reduced(task: Task, kept: Sequence[int]) -> Task:
     """The task of some of its entries; the cost and `stop` still get all of them, the others as 0.
 
-    Raises ConfigError where the cost depends on one of those.
+    A constraint, a simulator and a first controller are made of the task that this gives. Raises ConfigError where the
+    cost depends on an entry that is left out.
     """
     states, kept = len(task.state_names), list(kept)
     place, plant, stop = np.array(kept), task.plant, task.stop
