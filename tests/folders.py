@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax import tasks
-from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.assembly.experiments import assembled
 from pegasus_jax.runs import checkpoint, config_io, store
 from pegasus_jax.runs.restore import precision
 from pegasus_jax.task import Task
@@ -42,7 +42,7 @@ def a_run(run: Path, trials: int = 3, made: Task | None = None, **changes: str) 
     config_io.save(config, run / "config.yaml")
     store.note(run, "pegasus-train", 0, task)
     with precision(config):
-        state = jax.jit(compose(config, task).init)(jax.random.key(config.seed))
+        state = jax.jit(assembled(config, task, None, 0).init)(jax.random.key(config.seed))
         for trial in range(1, trials + 1):
             store.save_episode(run, trial, episode(task, trial), task, policy=trial - 1, ended="horizon")
             params = jax.tree.map(lambda leaf, trial=trial: leaf + trial / 10, state.policy.params)
