@@ -544,6 +544,9 @@ WRONG_PIECES: list[tuple[dict[str, Any], str]] = [
     (wrong_model(prepare=None), r"dynamics\.prepare=None is no function"),
     (wrong_model(posterior=lambda params: params), r"dynamics\.posterior: TypeError: .* 1 positional"),
     (wrong_model(apply=lambda *_: jnp.zeros(2)), r"dynamics\.apply returns an array; expected Prediction\("),
+    (dict(cost=lambda x: 0.5), r"the cost returns 0\.5 whatever the state is; .*\(test_api\.py:\d+\)"),
+    (dict(cost=lambda x: x), r"the cost returns an array of shape \(2,\); expected one number"),
+    (dict(cost=lambda x: jnp.abs(x[4])), r"the cost reads entry 4 of an array of 2 at test_api\.py:\d+; x has 2"),
     (
         wrong_model(apply=lambda *_: pg.Prediction(jnp.zeros(3), jnp.ones(2))),
         r"mean of what dynamics\.apply returns has shape \(3,\); expected \[D\] \(2,\)",

@@ -57,7 +57,7 @@ REFUSED = {
     "vec": "returns an array of shape (2,); expected one number, as jnp.sum makes of it (costs.py:8)",
     "one": "returns an array of shape (1,)",
     "reward": "negative, at x=[",
-    "const": "has a gradient of 0 at each of",
+    "const": "returns 0.5 whatever the state is",
     "constj": "has a gradient of 0 at each of",
     "intc": "returns a whole number or true or false, whose gradient is 0",
     "boolc": "returns a whole number or true or false, whose gradient is 0",

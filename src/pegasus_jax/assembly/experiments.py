@@ -24,6 +24,7 @@ from pegasus_jax.models.residual import on_differences, residual
 from pegasus_jax.policies.rate_limited import rate_limited
 from pegasus_jax.sharding import over_particles
 from pegasus_jax.task import Task, checked
+from pegasus_jax.tasks.cost_check import traced
 from pegasus_jax.tasks.remembered import remembering
 from pegasus_jax.types import (
     Array,
@@ -86,7 +87,10 @@ def compose(
     _of_kinds(config=config, task=task, dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher)
     _agree(config, task)
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher, cost=cost)
-    return assembled(config, task, mesh, logged, **pieces)
+    made = assembled(config, task, mesh, logged, **pieces)
+    states, circles = len(made.task.state_names), len(made.task.circles)
+    traced(made.task.cost.of_state, states + len(made.task.memory.names), states + circles, "the cost")
+    return made
 
 
 def _agree(config: settings.Config, task: Task) -> None:

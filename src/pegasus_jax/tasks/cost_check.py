@@ -57,7 +57,8 @@ def notes(
     It is traced once, and evaluated with its gradient at the start, at zero and at 100 points around them. Where it is
     flat, `seen` () makes the cost that a search begins with, wider, which may not be flat.
     """
-    _traced(cost, facts, what)
+    size = len(facts.start_mean)
+    traced(cost, size, size - len(facts.remembered) + len(facts.circles), what)
     points, values, slopes = _evaluated(cost, facts, what)
     least, most = int(np.argmin(values)), int(np.argmax(values))
     if values[least] < -1e-5 * max(1, np.abs(values).max()):
@@ -143,16 +144,15 @@ def scales(facts: Facts) -> np.ndarray:
     return np.where(known > 0, known, 1.0)
 
 
-def _traced(cost: Callable[[Any], Any], facts: Facts, what: str) -> None:
-    """Raises ConfigError unless JAX can trace the cost to one number, and it reads no entry that is not there."""
-    size = len(facts.start_mean)
+def traced(cost: Callable[[Any], Any], size: int, observed: int, what: str) -> None:
+    """Raises ConfigError unless JAX can trace the cost of x' [size] to one number, and it reads no entry beyond."""
 
     def one(x: Any) -> Any:
         value = cost(x)
         _number(value, cost, what)
         return jnp.asarray(value)
 
-    within(one, (size,), size - len(facts.remembered) + len(facts.circles), what, cost)
+    within(one, (size,), observed, what, cost)
 
 
 def within(
@@ -167,8 +167,8 @@ def within(
     `observed` is how many the user's x has; `blame` is the user's function, where it is another one.
     """
     with blamed(what, blame or function):
-        traced = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct((n,), jnp.zeros(()).dtype) for n in sizes))
-    for index, length, line in beyond(traced):
+        program = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct((n,), jnp.zeros(()).dtype) for n in sizes))
+    for index, length, line in beyond(program):
         raise ConfigError(
             f"{what} reads entry {index} of an array of {length}{_in(line)}; x has {observed}, 0 to {observed - 1}, and"
             " rates behind them with sensors.velocity="
@@ -184,6 +184,8 @@ def _number(value: Any, cost: Callable[[Any], Any], what: str) -> None:
         kind = f"a {type(value).__name__}; expected one number"
     elif np.shape(value):
         kind = f"an array of shape {np.shape(value)}; expected one number, as jnp.sum makes of it"
+    elif isinstance(value, float):
+        kind = f"{value:g} whatever the state is; expected a number that falls towards the goal"
     elif jnp.iscomplexobj(value):
         kind = "a complex number; expected a real one"
     elif not jnp.issubdtype(jnp.result_type(value), jnp.floating):
