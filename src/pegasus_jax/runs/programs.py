@@ -327,7 +327,7 @@ def gather(tree: Any) -> Any:
 def over_episodes(keys: Any) -> Iterator[Any]:
     """Of keys [S, E] those [S] of each of the E episodes, without a program that would take them apart."""
     numbers = np.asarray(jax.random.key_data(keys))
-    return (jax.random.wrap_key_data(numbers[:, episode]) for episode in range(numbers.shape[1]))
+    return (jax.random.wrap_key_data(jax.device_put(numbers[:, episode])) for episode in range(numbers.shape[1]))
 
 
 def is_main_process() -> bool:
