@@ -7,15 +7,15 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jax.sharding import Mesh
 
 from pegasus_jax import config as settings
 from pegasus_jax import episode, tasks
+from pegasus_jax.assembly.agreement import agree
 from pegasus_jax.assembly.own_pieces import try_dynamics, try_policy
 from pegasus_jax.assembly.pieces import drawing_rates, dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import fresh_policies, limits, refines_successes, search_of
-from pegasus_jax.checks import ConfigError, shown
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.config_used import check_config
 from pegasus_jax.experiment import Experiment, experiment
 from pegasus_jax.imagine import visited
@@ -85,63 +85,12 @@ def compose(
     your own that is late says so: `task._replace(late=2)` goes with `sensors.delay=2`.
     """
     _of_kinds(config=config, task=task, dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher)
-    _agree(config, task)
+    agree(config, task)
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher, cost=cost)
     made = assembled(config, task, mesh, logged, **pieces)
     states, circles = len(made.task.state_names), len(made.task.circles)
     traced(made.task.cost.of_state, states + len(made.task.memory.names), states + circles, "the cost")
     return made
-
-
-def _agree(config: settings.Config, task: Task) -> None:
-    """Raises ConfigError for a setting that says what the task is, where the task is otherwise."""
-    for setting, value in {"data": config.data, "init": config.init}.items():
-        if value:
-            raise ConfigError(
-                f"the Config has {setting}={shown(value)}, and compose reads no files: leave it out of the Config;"
-                " train(config) begins with it, load_logs reads logs"
-            )
-    for setting, field in _otherwise(config, task):
-        raise ConfigError(
-            f"the Config has {setting}=, and the task {task.name} has {field}={shown(getattr(task, field))}, which is"
-            f" what counts: leave it out of the Config; task._replace({field}=...) changes it, tasks.of_config(config)"
-            " makes a task"
-        )
-
-
-def _otherwise(config: settings.Config, task: Task) -> list[tuple[str, str]]:
-    """(setting, field of the task) wherever the config says one thing and the task is another."""
-    sensors, size, computed = config.sensors, len(task.state_names), config.sensors.velocity != "none"
-    given = {name: (name, getattr(config, name)) for name in ("stop", "constraint", "prior", "reference")}
-    given |= {
-        "goals": ("goal", config.goals or config.goal_low or None),
-        "explore.policy": ("guide", config.explore.policy),
-    }
-    lacks = [
-        (name, field) for name, (field, value) in given.items() if value is not None and getattr(task, field) is None
-    ]
-    entries = {  # of what is measured there may be none; an angle has the names of its cosine and its sine
-        **{
-            name: getattr(config, name) and not (getattr(task, name) or sensors.measured)
-            for name in ("circles", "rates")
-        },
-        "state_names": config.state_names and not any(name in str(task.state_names) for name in config.state_names),
-        "control_names": config.control_names not in ((), task.control_names),
-    }
-    known = {
-        ("sensors.measured", "state_names"): sensors.measured
-        and size != (len(sensors.measured) - len(task.circles)) * (1 + computed),
-        ("sensors.velocity", "rates"): computed and 2 * len(task.rates) != size,
-        ("sensors.delay", "late"): task.environment is None and sensors.delay not in (0, task.late),
-        **{(name, name): wrong for name, wrong in entries.items()},
-    }
-    numbers = {name: getattr(task, name) for name in ("horizon", "dt", "success", "stop_cost")}
-    others = [
-        (name, name)
-        for name, its in numbers.items()
-        if not isinstance(its, Tracer) and getattr(config, name) not in (getattr(settings.Config, name), its)
-    ]
-    return [*lacks, *(pair for pair, wrong in known.items() if wrong), *others]
 
 
 def assembled(config: settings.Config, task: Task, mesh: Mesh | None, logged: int, **pieces: Any) -> Experiment:
