@@ -541,6 +541,10 @@ WRONG_PIECES: list[tuple[dict[str, Any], str]] = [
     (wrong_model(loss=lambda *_: None), r"what dynamics\.loss returns is a NoneType; expected an array \(\)"),
     (wrong_model(loss=lambda *_: 3), r"what dynamics\.loss returns is of int32; expected floating"),
     (wrong_model(init=lambda key: {"w": 3}), r"what dynamics\.init returns\['w'\] is of int32; expected floating"),
+    (
+        wrong_model(init=lambda key: {"act": jnp.tanh}),
+        r"what dynamics\.init returns\['act'\] is a \w+; expected an array",
+    ),
     (wrong_model(prepare=None), r"dynamics\.prepare=None is no function"),
     (wrong_model(posterior=lambda params: params), r"dynamics\.posterior: TypeError: .* 1 positional"),
     (wrong_model(apply=lambda *_: jnp.zeros(2)), r"dynamics\.apply returns an array; expected Prediction\("),
@@ -564,6 +568,36 @@ def test_a_model_that_is_not_fitted_by_its_loss_needs_none() -> None:
     fitter = pg.minibatches(DYNAMICS, optax.adam(1e-3), batch_size=5)
     known = DYNAMICS._replace(loss=None, prepare=None)  # type: ignore[arg-type]
     assert pg.compose(CONFIG, TASK, dynamics=known, fitter=fitter).dynamics.loss is None
+
+
+def test_a_model_may_look_at_as_many_rows_as_there_is_room_for() -> None:
+    """Nearest neighbours, or inducing rows: more than a few."""
+    rows = pg.compose(CONFIG, TASK).init(key()).data.x.shape[0]
+    nearest = lambda data: jax.lax.top_k(data.x[:, 0], rows)[1]  # noqa: E731
+    near = DYNAMICS._replace(posterior=lambda params, data: (DYNAMICS.posterior(params, data), nearest(data)))
+    near = near._replace(apply=lambda posterior, *given: DYNAMICS.apply(posterior[0], *given), deal=None)
+    near = near._replace(sample=lambda key, posterior: DYNAMICS.sample(key, posterior[0]))
+    assert pg.compose(CONFIG, TASK, dynamics=near).dynamics is near
+
+
+def test_whole_numbers_are_parameters_where_no_gradient_is_taken() -> None:
+    counted = {"n": jnp.zeros((), int)}
+    policy = POLICY._replace(init=lambda key: counted, apply=lambda params, noise, x: x[:1])
+    searcher = pg.PolicyOptimizer(lambda params: (), lambda key, learner, *_, **__: (learner, None))
+    assert pg.compose(CONFIG, TASK, policy=policy, searcher=searcher).init(key()).policy.params == counted
+    with pytest.raises(pg.ConfigError, match=r"what policy\.init returns\['n'\] is of int32"):
+        pg.compose(CONFIG, TASK, policy=policy)
+
+
+@pytest.mark.parametrize("entries", [jnp.array([0, 1]), np.array([0, 1])])
+def test_a_cost_picks_entries_by_an_array_also_where_compose_is_traced(entries: Any) -> None:
+    def begun(scale: jax.Array) -> Any:
+        cost = lambda x: 1 - jnp.exp(-scale * jnp.sum(x[entries] ** 2))  # noqa: E731
+        return pg.compose(CONFIG, TASK, cost=cost).init(key()).policy.params
+
+    jax.eval_shape(begun, jnp.ones(()))
+    with pytest.raises(pg.ConfigError, match="the cost reads entry 2 of an array of 2"):
+        jax.eval_shape(lambda scale: pg.compose(CONFIG, TASK, cost=lambda x: scale * x[2] ** 2), jnp.ones(()))
 
 
 def test_the_cost_of_a_task_is_one_of_an_objective() -> None:

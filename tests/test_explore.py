@@ -141,8 +141,9 @@ def test_a_first_controller_suits_what_is_observed():
     angle = of_angles(task._replace(cost=Cost(jnp.sum)), ((0, 1),))
     for mine, its in ((task, angle), (angle, task), (task, task)):
         begin.suits("explore.policy=old", mine, its, observed=True)
+    begin.suits("explore.policy=old", task._replace(angles=()), task, observed=True)
     with pytest.raises(ConfigError, match=r"old is of .* with angles=\[2\], and .* has angles=\[\]"):
-        begin.suits("explore.policy=old", angle._replace(angles=(0,)), task, observed=True)
+        begin.suits("init=old", task._replace(angles=()), task)
     with pytest.raises(ConfigError, match="with 3 states, and cart has 2 states"):
         begin.suits("init=old", angle, task)
     limits = {"control_low": np.array([-5.0]), "dt": 0.7}

@@ -52,9 +52,9 @@ def test_the_facts_of_a_task_make_the_same_experiment(run: Path) -> None:
     x = np.array([0.1, 0.2, -0.3, 2.0], np.float32)
     u, expected = (e.policy.apply(state.policy.params, None, x) for e in (experiment, real))
     np.testing.assert_array_equal(u, expected)
-    assert restore.same(run, real.task) is None
+    assert restore.same(run, real.task, config) is None
     with pytest.raises(RunError, match="its control_high was"):
-        restore.same(run, real.task._replace(control_high=np.array([11.0])))
+        restore.same(run, real.task._replace(control_high=np.array([11.0])), config)
 
 
 def test_a_run_whose_rates_had_the_units_of_positions_is_the_same_run(run: Path) -> None:

@@ -34,8 +34,10 @@ def check_shape(name: str, value: Any, shape: Shape, index: str = "") -> None:
 def check_floating(name: str, tree: Params) -> None:
     """Raises ValueError unless every array of `tree` has floating-point entries: gradients are of no others."""
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        where = name + jax.tree_util.keystr(path)
+        if not isinstance(leaf, ARRAYS):
+            raise ValueError(f"{where} is a {type(leaf).__name__}; expected an array")
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
-            where = name + jax.tree_util.keystr(path)
             raise ValueError(f"{where} is of {jnp.result_type(leaf)}; expected floating-point numbers")
 
 

@@ -18,10 +18,11 @@ def agree(config: Config, task: Task) -> None:
                 " train(config) begins with it, load_logs reads logs"
             )
     for setting, field in otherwise(config, task):
+        alone = setting in ("sensors.measured", "sensors.velocity")  # of these the plant, starts and cost are, too
         raise ConfigError(
             f"the Config has {setting}=, and the task {task.name} has {field}={shown(getattr(task, field))}, which is"
-            f" what counts: leave it out of the Config; task._replace({field}=...) changes it, tasks.of_config(config)"
-            " makes a task"
+            f" what counts: leave it out of the Config; {'' if alone else f'task._replace({field}=...) changes it, '}"
+            "tasks.of_config(config) makes a task"
         )
 
 
@@ -47,13 +48,13 @@ def otherwise(config: Config, task: Task) -> list[tuple[str, str]]:
         ("circles", "circles", config.circles and not (task.circles or measured)),
         ("rates", "rates", config.rates and not (task.rates or measured)),
         ("state_names", "state_names", config.state_names and not named),
-        ("control_names", "control_names", config.control_names not in ((), task.control_names)),
+        ("control_names", "control_names", config.control_names not in ((), tuple(task.control_names))),
         (
             "sensors.measured",
             "state_names",
             measured and states != (measured - len(task.circles)) * (1 + computed),
         ),
         ("sensors.velocity", "rates", computed and 2 * len(task.rates) != states),
-        ("sensors.delay", "late", task.environment is None and sensors.delay not in (0, task.late)),
+        ("sensors.delay", "late", task.plant is not None and sensors.delay not in (0, task.late)),
     ]
     return [(setting, field) for setting, field, wrong in facts if wrong]

@@ -88,8 +88,9 @@ def compose(
     agree(config, task)
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher, cost=cost)
     made = assembled(config, task, mesh, logged, **pieces)
-    states, circles = len(made.task.state_names), len(made.task.circles)
-    traced(made.task.cost.of_state, states + len(made.task.memory.names), states + circles, "the cost")
+    if searcher is None:  # another may have no use for a gradient
+        states, circles = len(made.task.state_names), len(made.task.circles)
+        traced(made.task.cost.of_state, states + len(made.task.memory.names), states + circles, "the cost")
     return made
 
 
@@ -100,9 +101,9 @@ def assembled(config: settings.Config, task: Task, mesh: Mesh | None, logged: in
     task = remembering(config, checked(task._replace(cost=as_cost(task.cost))))
     task = tasks.whole(task, None if cost is None else as_cost(cost))
     if dynamics is not None:
-        try_dynamics(dynamics, task, fits=fitter is None)
+        try_dynamics(dynamics, task, capacity(config, task, logged), fits=fitter is None)
     if policy is not None:
-        try_policy(policy._replace(memory=task.memory) if task.memory.names else policy, task)
+        try_policy(policy, task, follows=searcher is None)
     dynamics = dynamics or dynamics_of(config.model, task)
     fitter = fitter or drawing_rates(fit_of(config.fit, dynamics), dynamics, task)
     if task.prior is not None:  # then all of that is of what the simulator gets wrong

@@ -16,13 +16,11 @@ from pegasus_jax.task import Task
 from pegasus_jax.tasks.user_code import blamed
 from pegasus_jax.types import Batch, Dynamics, Key, Policy
 
-ROWS = 8  # of the data that a model is tried with
 
+def try_dynamics(dynamics: Dynamics, task: Task, rows: int, fits: bool) -> None:
+    """Raises ConfigError unless a model of one's own takes and returns what `Dynamics` says, for `rows` of this task.
 
-def try_dynamics(dynamics: Dynamics, task: Task, fits: bool) -> None:
-    """Raises ConfigError unless a model of one's own takes and returns what `Dynamics` says, for this task.
-
-    `fits` says whether its loss is minimized: a fitter of one's own may have no use for it.
+    `fits` says whether its loss is minimized: a fitter of one's own may have no use for it, nor for gradients.
     """
     states, inputs = len(task.state_names), given_size(task.memory, len(task.control_names))
     inputs += states if task.prior is not None else 0  # it is told what the simulator does: models/residual.py
@@ -31,27 +29,35 @@ def try_dynamics(dynamics: Dynamics, task: Task, fits: bool) -> None:
     def each(key: Key) -> None:
         first, second, third = jax.random.split(key, 3)
         params = called("dynamics", dynamics, "init", first)
-        check_floating("what dynamics.init returns", params)
-        data = empty(ROWS, states, inputs + more, len(task.memory.names))
+        data = empty(rows, states, inputs + more, len(task.memory.names))
         if fits:
+            check_floating("what dynamics.init returns", params)
             context, batch = called("dynamics", dynamics, "prepare", data), Batch(data.x, data.u, data.y)
             loss = called("dynamics", dynamics, "loss", params, second, batch, context)
             check_shape("what dynamics.loss returns", loss, ())
         posterior = called("dynamics", dynamics, "posterior", params, data)
-        draw, x, u = called("dynamics", dynamics, "sample", third, posterior), jnp.zeros(states), jnp.zeros(inputs)
+        if dynamics.deal is None:
+            draw = called("dynamics", dynamics, "sample", third, posterior)
+        else:
+            draw = jax.tree.map(lambda leaf: leaf[0], called("dynamics", dynamics, "deal", third[None], posterior))
+        x, u = jnp.zeros(states), jnp.zeros(inputs)
         predicted = called("dynamics", dynamics, "apply", posterior, draw, x, u)
         check_prediction("dynamics.apply returns", predicted, x.shape, "[D]")
 
     tried(each)
 
 
-def try_policy(policy: Policy, task: Task) -> None:
-    """Raises ConfigError unless a policy of one's own takes and returns what `Policy` says, for this task."""
+def try_policy(policy: Policy, task: Task, follows: bool) -> None:
+    """Raises ConfigError unless a policy of one's own takes and returns what `Policy` says, for this task.
+
+    `follows` says whether it follows a gradient: a searcher of one's own may have no use for one.
+    """
 
     def each(key: Key) -> None:
         first, second = jax.random.split(key)
         params = called("policy", policy, "init", first)
-        check_floating("what policy.init returns", params)
+        if follows:
+            check_floating("what policy.init returns", params)
         noise = called("policy", policy, "sample", second)
         u = called("policy", policy, "apply", params, noise, jnp.zeros(len(seen_names(task))))
         check_shape("what policy.apply returns", u, (len(task.control_names),), "[U]")

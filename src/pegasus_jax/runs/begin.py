@@ -6,7 +6,6 @@ first.py copies the run of explore.policy= in the same way.
 """
 
 import shutil
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,6 @@ import numpy as np
 from pegasus_jax.checks import ConfigError, RunError, shown
 from pegasus_jax.config import Config, begins_with
 from pegasus_jax.experiment import Experiment
-from pegasus_jax.math.circles import entries
 from pegasus_jax.memory import seen_kinds, seen_names
 from pegasus_jax.runs import checkpoint, config_io, logged, restore, store
 from pegasus_jax.task import Task
@@ -91,23 +89,15 @@ def checked(config: Config, task: Task) -> list[str]:
 def suits(what: str, task: Task, theirs: Task, observed: bool = False, more: str = "") -> None:
     """Raises ConfigError where another run's policy cannot act on a task: other numbers, or other angles.
 
-    With `observed` it is given the observation, whose pairs of a cosine and a sine may be angles to one run only.
+    With `observed` it is given the observation, and knows itself which of that are angles.
     """
 
-    def size(one: Task) -> int:
-        return len(one.state_names) + observed * len(one.circles)
+    def facts_of(one: Task) -> list[str]:
+        angles = [] if observed else [f"angles={shown(list(one.angles))}"]
+        states = len(one.state_names) + observed * len(one.circles)
+        return [f"{states} states", f"{len(one.control_names)} controls", *angles]
 
-    def angles(one: Task) -> list[int]:
-        places = entries(size(one), one.circles) if observed else range(size(one))
-        pairs = {min(pair) for pair in one.circles} if observed else set()
-        return [places[i] for i in one.angles if places[i] not in pairs]
-
-    words: tuple[Callable[[Task], str], ...] = (
-        lambda one: f"{size(one)} states",
-        lambda one: f"{len(one.control_names)} controls",
-        lambda one: f"angles={shown(angles(one))}",
-    )
-    for its, mine in ((word(theirs), word(task)) for word in words):
+    for its, mine in zip(facts_of(theirs), facts_of(task), strict=True):
         if its != mine:
             raise ConfigError(f"{what} is of {theirs.name} with {its}, and {task.name} has {mine}{more}")
 

@@ -124,14 +124,17 @@ def unknown_cost(*_: Any) -> Any:
     raise RunError("the cost of this task is code of its user, which was not imported; pegasus-eval imports it")
 
 
-def difference(stored: dict[str, Any], made: dict[str, Any]) -> str | None:
-    """In what two tasks differ, in words, or None. A model that was only renamed is the same one."""
+def difference(stored: dict[str, Any], made: dict[str, Any], pairs: bool) -> str | None:
+    """In what two tasks differ, in words, or None. A model that was only renamed is the same one.
+
+    `pairs` says whether the run's model looks at which rate is of which coordinate.
+    """
     moved = {"name"} if "mjcf_digest" in stored and stored["mjcf_digest"] == made.get("mjcf_digest") else set()
     for name in sorted({*stored, *made} - moved, key=lambda name: name != "mjcf_digest"):
         one, other = stored.get(name), made.get(name)
-        # An earlier version kept a rate without its coordinate: no model made use of it.
-        unpaired = name == "rates" and 2 * max(len(one or ()), len(other or ())) < len(made["state_names"])
-        if not unpaired and not _same(one, other):
+        # An earlier version kept rates without their coordinates, or in another order.
+        unused = name == "rates" and not pairs
+        if not unused and not _same(one, other):
             return f"its {name} was {_short(one)} and now is {_short(other)}"
     return None
 

@@ -20,7 +20,7 @@ import numpy as np
 from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import assembled, set_precision
 from pegasus_jax.checks import ConfigError, RunError, names_code
-from pegasus_jax.config import Config
+from pegasus_jax.config import Config, Lagrangian
 from pegasus_jax.episode import verdict
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.runs import checkpoint, config_io, facts, logged, store
@@ -195,7 +195,7 @@ def planted(run: Path, config: Config) -> Task:
     """
     announce(run, config)
     task = tasks.of_config(config)
-    same(run, task)
+    same(run, task, config)
     return task._replace(name=store.task_of(run).name)
 
 
@@ -216,9 +216,11 @@ def moved(run: Path, config: Config, mjcf: str | None = None) -> Config:
     return replace(config, mjcf=os.path.abspath(file))
 
 
-def same(run: Path, task: Task) -> None:
-    """Raises RunError unless this is the task that a run began with, as far as its folder tells."""
-    if (run / "run.json").exists() and (what := facts.difference(store.stored(run)["task"], facts.of_task(task))):
+def same(run: Path, task: Task, config: Config) -> None:
+    """Raises RunError unless this is the task that a run of this config began with, as far as its folder tells."""
+    if not (run / "run.json").exists():
+        return
+    if what := facts.difference(store.stored(run)["task"], facts.of_task(task), isinstance(config.model, Lagrangian)):
         raise RunError(f"the task of {run / 'config.yaml'} is not that of run.json, with which it began: {what}")
 
 

@@ -98,7 +98,7 @@ def train_seeds(
         for run in folders if begun.rows and not resume and is_main_process() else ():
             logged.save(run, begun.episodes(), task)
         for run in folders if resume else ():
-            restore.same(run, task)
+            restore.same(run, task, config)
         stored = restore.together(folders, job.experiment, say) if resume else None
         done = None if stored is None else int(stored.trial[0])
         job = job._replace(cost_since=[costs_since(run, task, done, say) for run in folders if done])

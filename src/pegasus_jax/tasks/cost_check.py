@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.math.circles import Circles, to_observation
@@ -199,7 +200,9 @@ def beyond(traced: Any, given: Sequence[Any] = ()) -> list[tuple[int, int, str |
 
     JAX does not refuse these: it takes the nearest entry, or NaN. Indices are followed through the program's integers.
     """
-    return _walk(traced.jaxpr, traced.consts, list(given) or [None] * len(traced.jaxpr.invars))[0]
+    consts = [None if isinstance(value, Tracer) else value for value in traced.consts]  # of a trace around this one
+    with jax.ensure_compile_time_eval():
+        return _walk(traced.jaxpr, consts, list(given) or [None] * len(traced.jaxpr.invars))[0]
 
 
 def _walk(jaxpr: Any, consts: Sequence[Any], given: Sequence[Any]) -> tuple[list[Any], list[Any]]:
