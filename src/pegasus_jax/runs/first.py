@@ -78,7 +78,7 @@ def policy_of(folder: Path, trial: int, what: str) -> Callable[[Any], Any]:
     """
     # The second has the digests of all that a checkpoint holds.
     files = (folder / name for name in ("config.yaml", f"checkpoints/{trial:04d}.json"))
-    return _policy(folder, trial, what, "".join(file.read_text() for file in files if file.is_file()))
+    return _policy(folder, trial, what, "".join(file.read_text(encoding="utf-8") for file in files if file.is_file()))
 
 
 @lru_cache(maxsize=8)
