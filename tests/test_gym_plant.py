@@ -269,7 +269,7 @@ def test_constructor_arguments_are_what_they_look_like() -> None:
         max_leaves=5,
     )
 )
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_a_value_from_python_reaches_the_constructor_as_it_is(value: Any) -> None:
     """Also from the config.yaml of a run; a list of numbers of NumPy, or a tuple, as a list."""
     assume("${" not in str(value))
