@@ -61,6 +61,11 @@ class Task(NamedTuple):
     late: int = 0  # control periods that a control waits in `plant`, of which a controller has to remember them
 
     @property
+    def observed(self) -> int:
+        """How many entries x of its user's functions has: of an angle of a circle the cosine and the sine."""
+        return len(self.state_names) + len(self.circles)
+
+    @property
     def may_end(self) -> bool:
         """Whether an episode may be shorter than the horizon."""
         return self.environment is not None or self.stop is not None

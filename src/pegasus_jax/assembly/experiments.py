@@ -89,8 +89,8 @@ def compose(
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher, cost=cost)
     made = assembled(config, task, mesh, logged, **pieces)
     if searcher is None:  # another may have no use for a gradient
-        states, circles = len(made.task.state_names), len(made.task.circles)
-        traced(made.task.cost.of_state, states + len(made.task.memory.names), states + circles, "the cost")
+        size = len(made.task.state_names) + len(made.task.memory.names)
+        traced(made.task.cost.of_state, size, made.task.observed, "the cost")
     return made
 
 

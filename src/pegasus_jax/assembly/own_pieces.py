@@ -3,6 +3,7 @@
 What is wrong with one is then a line that names its function, and not a message from inside a fit or a search.
 """
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -25,23 +26,24 @@ def try_dynamics(dynamics: Dynamics, task: Task, rows: int, fits: bool) -> None:
     states, inputs = len(task.state_names), given_size(task.memory, len(task.control_names))
     inputs += states if task.prior is not None else 0  # it is told what the simulator does: models/residual.py
     more = 0 if task.hindsight is None else task.hindsight.more
+    call = partial(called, "dynamics", dynamics)
 
     def each(key: Key) -> None:
         first, second, third = jax.random.split(key, 3)
-        params = called("dynamics", dynamics, "init", first)
+        params = call("init", first)
         data = empty(rows, states, inputs + more, len(task.memory.names))
         if fits:
             check_floating("what dynamics.init returns", params)
-            context, batch = called("dynamics", dynamics, "prepare", data), Batch(data.x, data.u, data.y)
-            loss = called("dynamics", dynamics, "loss", params, second, batch, context)
+            context, batch = call("prepare", data), Batch(data.x, data.u, data.y)
+            loss = call("loss", params, second, batch, context)
             check_shape("what dynamics.loss returns", loss, ())
-        posterior = called("dynamics", dynamics, "posterior", params, data)
+        posterior = call("posterior", params, data)
         if dynamics.deal is None:
-            draw = called("dynamics", dynamics, "sample", third, posterior)
+            draw = call("sample", third, posterior)
         else:
-            draw = jax.tree.map(lambda leaf: leaf[0], called("dynamics", dynamics, "deal", third[None], posterior))
+            draw = jax.tree.map(lambda leaf: leaf[0], call("deal", third[None], posterior))
         x, u = jnp.zeros(states), jnp.zeros(inputs)
-        predicted = called("dynamics", dynamics, "apply", posterior, draw, x, u)
+        predicted = call("apply", posterior, draw, x, u)
         check_prediction("dynamics.apply returns", predicted, x.shape, "[D]")
 
     tried(each)
@@ -52,14 +54,15 @@ def try_policy(policy: Policy, task: Task, follows: bool) -> None:
 
     `follows` says whether it follows a gradient: a searcher of one's own may have no use for one.
     """
+    call = partial(called, "policy", policy)
 
     def each(key: Key) -> None:
         first, second = jax.random.split(key)
-        params = called("policy", policy, "init", first)
+        params = call("init", first)
         if follows:
             check_floating("what policy.init returns", params)
-        noise = called("policy", policy, "sample", second)
-        u = called("policy", policy, "apply", params, noise, jnp.zeros(len(seen_names(task))))
+        noise = call("sample", second)
+        u = call("apply", params, noise, jnp.zeros(len(seen_names(task))))
         check_shape("what policy.apply returns", u, (len(task.control_names),), "[U]")
 
     tried(each)

@@ -103,11 +103,11 @@ def _row(row: dict[str, Any], best: bool, covered: dict[int, float | None], expl
     """The cells of a trial; it leads to its trajectories, where there are some."""
     trial, (spent, compiling) = row["trial"], store.computing(row)
     name = f'<a href="#trial-{trial}">{trial}</a>' if trial in covered else str(trial)
+    who = executed([row], exploring).removeprefix("episode ").removeprefix("of ").removeprefix("by the ")
     return [
         f"{name} <b>best</b>" if best else name,
         f"{row['plant_seconds']:g}",
-        escape(executed([row], exploring).removeprefix("episode ").removeprefix("of ").removeprefix("by the "))
-        + escape(early(row)),
+        escape(who + early(row)),
         number(row.get("episode_cost")),
         number(row.get("mean_cost")),
         number(row.get("success_rate"), ".0%"),

@@ -94,7 +94,7 @@ def suits(what: str, task: Task, theirs: Task, observed: bool = False, more: str
 
     def facts_of(one: Task) -> list[str]:
         angles = [] if observed else [f"angles={shown(list(one.angles))}"]
-        states = len(one.state_names) + observed * len(one.circles)
+        states = one.observed if observed else len(one.state_names)
         return [f"{states} states", f"{len(one.control_names)} controls", *angles]
 
     for its, mine in zip(facts_of(theirs), facts_of(task), strict=True):

@@ -131,8 +131,7 @@ def stopping(config: Config, task: Task) -> None:
     if task.stop is None:
         return
     what = f"stop={shown(config.stop)}"
-    states = len(task.state_names)
-    cost_check.within(task.stop, (states + len(task.memory.names),), states + len(task.circles), what)
+    cost_check.within(task.stop, (len(task.state_names) + len(task.memory.names),), task.observed, what)
     with user_code.blamed(what, task.stop):
         value = jnp.asarray(task.stop(jnp.asarray(task.start_mean, float)))
     if value.shape != ():

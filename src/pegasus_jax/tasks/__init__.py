@@ -222,7 +222,7 @@ def observation_limits(config: Config, task: Task) -> tuple[np.ndarray, np.ndarr
         space: Any = environment(config).observation_space
         low, high = (sensed.state_of(np.array(limit, float), task, config.sensors) for limit in (space.low, space.high))
         rates = task.rates if config.sensors.velocity != "none" else ()
-        free = [*circles.angle_places(len(task.state_names) + len(task.circles), task.circles), *rates]
+        free = [*circles.angle_places(task.observed, task.circles), *rates]
         low[free], high[free] = -np.inf, np.inf
         return low, high
     return np.full(len(task.state_names), -np.inf), np.full(len(task.state_names), np.inf)

@@ -29,8 +29,7 @@ def of_config(config: Config, task: Task) -> Constraint | None:
     def numbers(x: Array) -> Array:
         return jnp.atleast_1d(jnp.asarray(function(to_observation(x, task.circles))))
 
-    states = len(task.state_names)
-    cost_check.within(numbers, (states,), states + len(task.circles), what, function)
+    cost_check.within(numbers, (len(task.state_names),), task.observed, what, function)
     with user_code.blamed(what, function):
         values = jax.jit(lambda rows: jax.lax.map(numbers, rows))(points)
     if values.ndim != 2 or not jnp.issubdtype(values.dtype, jnp.floating):

@@ -45,7 +45,7 @@ def check(config: Config, task: Task) -> None:
     with user_code.blamed(what, guide):
         u = np.asarray(guide(start), float)
         if task.environment is None:
-            cost_check.within(lambda x: jnp.asarray(guide(x), float), start.shape, len(start) + len(task.circles), what)
+            cost_check.within(lambda x: jnp.asarray(guide(x), float), start.shape, task.observed, what)
     controls = len(task.control_names)
     if u.shape != (controls,):
         raise ConfigError(f"{what} returns an array of shape {u.shape}; expected ({controls},), a number a control")

@@ -39,8 +39,8 @@ def of_config(config: Config, task: Task) -> Simulate | None:
     def simulate(x: Array, u: Array) -> Array:
         return circles.to_state(function(circles.to_observation(x, task.circles), u), task.circles)
 
-    states, controls = len(task.state_names), len(task.control_names)
-    cost_check.within(simulate, (states, controls), states + len(task.circles), what, function)
+    sizes = len(task.state_names), len(task.control_names)
+    cost_check.within(simulate, sizes, task.observed, what, function)
     return checked(what, simulate, task, function)
 
 
