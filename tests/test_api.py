@@ -878,7 +878,9 @@ def test_a_setting_that_makes_another_task_is_not_dropped(settings: dict[str, An
 
 
 def test_what_is_no_config_or_no_task_is_one_line() -> None:
-    for given, says in (((TASK, CONFIG), "config=Task is no Config"), ((CONFIG, "cartpole"), "task=str is no Task")):
+    configs = [((TASK, CONFIG), "config=Task is no Config"), ((None, TASK), "config=NoneType is no Config")]
+    others = [((CONFIG, "cartpole"), "task=str is no Task"), ((CONFIG, None), "task=NoneType is no Task")]
+    for given, says in configs + others:
         with pytest.raises(pg.ConfigError, match=f"^{says}; expected pegasus_jax"):
             pg.compose(*given)  # type: ignore[arg-type]
 

@@ -174,8 +174,9 @@ HELPS = {"config": "; preset(NAME) makes one", "task": "; tasks.make(NAME) makes
 def _of_kinds(**pieces: Any) -> None:
     """Raises ConfigError for a piece of another kind: one of optax, for example, has an `init`, too."""
     for name, piece in pieces.items():
-        if piece is not None and not isinstance(piece, kind := PIECES[name]):
-            fields = f"({', '.join(kind._fields)})" if name not in ("config", "task") else ""
+        needed = name in ("config", "task")
+        if (needed or piece is not None) and not isinstance(piece, kind := PIECES[name]):
+            fields = "" if needed else f"({', '.join(kind._fields)})"
             expected = f"pegasus_jax.{kind.__name__}{fields}{HELPS.get(name, '')}"
             raise ConfigError(f"{name}={type(piece).__name__} is no {kind.__name__}; expected {expected}")
 
