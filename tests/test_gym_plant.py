@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 from pegasus_envs import gym_plant
 from pegasus_envs.gym_plant import close_environments, env_plant, env_spec, make_env, period
-from pegasus_jax import episode, interrupt, tasks
+from pegasus_jax import episode, interrupt, start, tasks
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
@@ -281,6 +281,15 @@ def test_a_value_from_python_reaches_the_constructor_as_it_is(value: Any) -> Non
     found = gym_plant._value(pair.removeprefix("x="))
     assert found == value
     assert type(found) is type(value)
+
+
+def test_arguments_from_python_may_be_a_dict(tmp_path: Path) -> None:
+    dotted, nested = {"env_args.x": "5", "env_args.y": 2}, {"env_args": {"x": "5", "y": 2}}
+    assert preset("gym", settings=nested).env_args == preset("gym", settings=dotted).env_args == ('x="5"', "y=2")
+    for words in ({"env_args": {"pole_mas": 1}}, {"env_args.pole_mas": 1}):
+        for config in ("cartpole", preset("cartpole")):
+            with pytest.raises(ConfigError, match=r"env_args.pole_mas is no constant of the plant; .*pole_mass"):
+                start.train(config, settings=words, out=tmp_path / "run")
 
 
 def test_what_no_folder_can_keep_is_no_argument() -> None:

@@ -44,7 +44,8 @@ def preset(
 
     `model`, `policy`, `algorithm` and `effort` are the command's words. `settings` are its other ones, by name, each
     with its text or its value: {"search.steps": 200, "explore.kind": "walk"}. An env_args.NAME is given as it is, "5"
-    as a text and a tuple as a list. Raises ConfigError as the command would, in one line with the nearest choice.
+    as a text and a tuple as a list; {"env_args": {"NAME": "5"}} is the same. Raises ConfigError as the command would,
+    in one line with the nearest choice.
     """
     from pegasus_jax.runs import config_io
 
@@ -102,6 +103,7 @@ def _config_of(config: Config | str | None, given: dict[str, Any]) -> Config:
 
     if isinstance(config, Config):
         check_config(config)
+        given = config_io.of_python(given)
         check_used(config.task, given)
         return config_io.override(config, config_io.values(config_io.without_random(given)))
     if config is not None and not isinstance(config, str):

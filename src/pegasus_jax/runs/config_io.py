@@ -84,8 +84,15 @@ def _with_arguments(words: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def of_python(words: Mapping[str, Any]) -> dict[str, Any]:
-    """The words of a Python program: what it gives an environment is what it gets, also the text "5"."""
-    return {key: _json(key, value) if _argument(key) else value for key, value in words.items()}
+    """The words of a Python program: what it gives an environment is what it gets, also the text "5".
+
+    The environment's arguments may be {"env_args.port": 5} or {"env_args": {"port": 5}}.
+    """
+    if isinstance(own := words.get("env_args"), Mapping):
+        words = {key: value for key, value in words.items() if key != "env_args"} | {
+            f"{ARGUMENTS}{name}": value for name, value in own.items()
+        }
+    return _with_arguments({key: _json(key, value) if _argument(key) else value for key, value in words.items()})
 
 
 def _argument(key: str) -> bool:
