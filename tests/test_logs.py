@@ -98,6 +98,14 @@ def test_a_file_without_header_is_read_in_order(tmp_path):
     same(transitions(CART, str(path), columns=("1*1", "0", "2"))[0], ROWS[:, [1, 0, 2]])
 
 
+@pytest.mark.parametrize("mark", [";", "\t"])
+@pytest.mark.parametrize("header", ["", "x,v,u"])
+def test_a_comma_is_a_decimal_one_where_another_mark_is_between_cells(header, mark, tmp_path):
+    path, rows = tmp_path / "a.csv", [mark.join(map(str, row)).replace(".", ",") for row in ROWS]
+    path.write_text("\n".join([header.replace(",", mark)] * bool(header) + rows))
+    same(transitions(CART, str(path))[0])
+
+
 def test_a_control_is_the_one_sent_at_a_row_or_before_it(tmp_path):
     before = ROWS.copy()
     before[1:, 2], before[0, 2] = ROWS[:-1, 2], np.nan

@@ -13,7 +13,7 @@ from pegasus_jax.logs.table import Table, reason
 def of_csv(path: Path) -> Table:
     """The table of a text file, cells apart by commas, semicolons or tabs; a first line that is no numbers is a header.
 
-    Between semicolons a comma is a decimal one. Empty lines, and those that begin with #, are left out. Of the
+    Between semicolons or tabs a comma is a decimal one. Empty lines, and those that begin with #, are left out. Of the
     latter the last before the first row is a header too if it can be, as NumPy writes it. Raises ConfigError, with
     the line, for a row of another length.
     """
@@ -82,8 +82,8 @@ def _header(first: list[str], above: list[str], second: list[str], mark: str) ->
 
 
 def _number(cell: str, mark: str) -> float | None:
-    """A cell's number, whose decimal mark may be a comma where a semicolon is between the cells; None: it is none."""
+    """A cell's number, whose decimal mark may be a comma where none is between the cells; None: it is none."""
     try:
-        return float(cell.replace(",", ".") if mark == ";" else cell)
+        return float(cell if mark == "," else cell.replace(",", "."))
     except ValueError:
         return None
