@@ -320,11 +320,10 @@ def _of_hinges(angles: tuple[int, ...], hinges: tuple[int, ...], names: tuple[st
 
 def mjcf_digest(task: Task) -> str | None:
     """SHA-256 of the compiled model of a task=mjcf, whatever files it was made of; None of another task."""
-    if task.plant is None:
+    mjcf_plant = sys.modules.get("pegasus_envs.mjcf_plant")  # MJX takes a second to import, and made no other task
+    if mjcf_plant is None or not isinstance(task.plant, mjcf_plant.Mechanism):
         return None
-    from pegasus_envs import mjcf_plant
-
-    return mjcf_plant.digest(task.plant.model) if isinstance(task.plant, mjcf_plant.Mechanism) else None
+    return mjcf_plant.digest(task.plant.model)
 
 
 @contextmanager
