@@ -37,6 +37,8 @@ import jax
 import pytest
 from hypothesis import settings
 
+import forked
+
 # A random key used twice raises, in jit and scan too: PEGASUS rests on knowing which draw is which. One false alarm is
 # known, in jax 0.10 and 0.12: vmap of a scan over split keys. probes.unchecked switches the check off for that.
 jax.config.update("jax_debug_key_reuse", True)
@@ -65,12 +67,17 @@ def pytest_runtest_setup(item):
         pytest.skip("needs a GPU")
 
 
+def cpu_seconds():
+    """Of this process and of those that it started, until now."""
+    return sum(os.times()[:4]) + sum(forked.spent)
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call(item):
     """A test that takes long has to say so. CPU time, its processes' too: it hardly depends on what else is running."""
-    began = os.times()
+    began = cpu_seconds()
     result = yield
-    spent = sum(os.times()[:4]) - sum(began[:4])
+    spent = cpu_seconds() - began
     if spent > QUICK and not item.get_closest_marker("slow") and not item.get_closest_marker("campaign"):
         pytest.fail(f"took {spent:.0f} s of CPU time; above {QUICK} s: mark it slow, or make it quicker", pytrace=False)
     return result

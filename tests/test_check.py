@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 
+import forked
 from benchmarks import once
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.train import check as check_command
@@ -74,8 +73,7 @@ TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5"
 
 def call(name: str, *words: str, cwd: Path) -> tuple[int, str, list[str]]:
     (cwd / "robot.py").write_text(ROBOT)
-    program = [sys.executable, "-P", "-c", f"from pegasus_jax.cli.main import {name}; {name}()"]
-    done = subprocess.run([*program, *once(*WORDS, *words)], cwd=cwd, capture_output=True, text=True, check=False)
+    done = forked.command(name, *once(*WORDS, *words), cwd=cwd)
     log = cwd / "asked.log"
     return done.returncode, done.stdout + done.stderr, log.read_text().split() if log.exists() else []
 

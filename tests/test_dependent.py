@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import forked
 from pegasus_jax.runs import store
 
 ROBOT = """
@@ -43,10 +42,7 @@ TINY = "success=2 search.steps=20 search.particles=30 model.hidden=[20] policy.h
 def test_every_update_is_finite(tmp_path: Path) -> None:
     """An angle, its tip's height, the angle in degrees, a constant and 1e4: each update of fit and search counts."""
     (tmp_path / "robot.py").write_text(ROBOT)
-    program = [sys.executable, "-P", "-c", "from pegasus_jax.cli.main import train; train()"]
-    done = subprocess.run(
-        [*program, *WORDS.split(), *TINY.split()], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = forked.command("train", *WORDS.split(), *TINY.split(), cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for row in store.trials(tmp_path / "run"):
         assert row["skipped_updates"] == 0

@@ -23,6 +23,7 @@ from urllib.request import urlopen
 import jax
 import pytest
 
+import forked
 from pegasus_jax.runs.config_io import parse, split
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -75,6 +76,9 @@ NOT_RUN = {
     "make test": "it would run this test again",
 }
 SERVES = "pegasus-watch "  # until a person ends it
+# Pages of which each command is a new process, as a reader's is; of the others our commands begin as forked.py says.
+ANEW = ("README", "quickstart")
+OURS = re.compile(r"pegasus-[^;&|<>`$]*")  # and nothing else that a shell would do
 TINY = "fit.steps=3 search.steps=4"
 SMALL = {  # a part of a command -> a setting that makes it small, unless the command is about that
     "model=": "model.hidden=[8]",
@@ -96,16 +100,23 @@ def cut(command: str) -> str:
     return " ".join([TINY, *small, "explore.trials=2", "trials=2" if learns else "trials=1"])
 
 
+def scripts() -> dict[str, str]:
+    """The programs of the commands of pyproject.toml."""
+    told = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
+    places = {name: where.split(":") for name, where in told.items()}
+    return {
+        name: f"import sys\nfrom {module} import {function}\nsys.exit({function}())\n"
+        for name, (module, function) in places.items()
+    }
+
+
 @pytest.fixture(scope="module")
 def tools(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     """The environment of a shell in which this interpreter and the commands of pyproject.toml are found."""
     folder = tmp_path_factory.mktemp("tools")
     (folder / "bin").mkdir()
-    scripts = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["scripts"]
-    for name, where in scripts.items():
-        module, function = where.split(":")
-        program = f"#!{sys.executable}\nimport sys\nfrom {module} import {function}\nsys.exit({function}())\n"
-        (folder / "bin" / name).write_text(program)
+    for name, program in scripts().items():
+        (folder / "bin" / name).write_text(f"#!{sys.executable}\n{program}")
     python = folder / "bin" / "python"  # not a link: it would not know its environment
     python.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} "$@"\n')
     (folder / ".installed").touch()
@@ -125,6 +136,16 @@ def shell(command: str, folder: Path, environment: dict[str, str]) -> None:
     done = subprocess.run(
         ["sh", "-c", command], cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+
+
+def forks(command: str, folder: Path, environment: dict[str, str]) -> None:
+    """A command of ours, with the words that a shell makes of it."""
+    split = subprocess.run(
+        ["sh", "-c", f"printf '%s\\n' {command}"], cwd=folder, capture_output=True, text=True, check=True
+    )
+    name, *words = split.stdout.splitlines()
+    done = forked.run(f"import sys; sys.argv[0] = {name!r}\n{scripts()[name]}", words, folder, environment)
     assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
 
 
@@ -148,7 +169,8 @@ def test_a_page_runs_from_the_top_to_the_end(page: Path, tmp_path: Path, tools: 
             if command.startswith(SERVES):
                 watched(command, tmp_path, tools)
             elif command not in NOT_RUN:
-                shell(command, tmp_path, {**tools, "PEGASUS_SETTINGS": cut(command)})
+                begin = forks if page.stem not in ANEW and OURS.fullmatch(command) else shell
+                begin(command, tmp_path, {**tools, "PEGASUS_SETTINGS": cut(command)})
 
 
 def watched(command: str, folder: Path, environment: dict[str, str]) -> None:

@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+import forked
 import pegasus_jax as pg
 from benchmarks import once
 from pegasus_jax.checks import ConfigError
@@ -27,7 +28,11 @@ LENGTHS = (12, 5)  # control periods of the logs; the first is longer than a hor
 
 def command(*words: object) -> list[str]:
     program = "from pegasus_jax.cli.main import train; train()"
-    return [sys.executable, "-c", program, *once(*TINY.split(), *words)]
+    return [sys.executable, "-P", "-c", program, *words_of(*words)]
+
+
+def words_of(*words: object) -> list[str]:
+    return once(*TINY.split(), *words)
 
 
 @pytest.fixture(scope="module")
@@ -94,9 +99,7 @@ def test_killed_before_its_first_trial_it_needs_the_logs_no_more(place: Path, wh
     assert store.numbered(run / "logged", ".npz") == [1, 2, 3]
     assert not (run / "trials.jsonl").exists() or store.trials(run) == []
     shutil.rmtree(tmp_path / "logs")
-    program = "from pegasus_jax.cli.main import train; train()"
-    going_on = [sys.executable, "-c", program, f"resume={run}"]
-    done = subprocess.run(going_on, cwd=tmp_path, capture_output=True, text=True)
+    done = forked.command("train", f"resume={run}", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     states = [checkpoint.fingerprint(restored(one)[2]) for one in (run, whole)]
     assert states[0] == states[1]
@@ -118,8 +121,8 @@ def test_another_run_begins_with_what_was_learned_from_logs(whole: Path, tmp_pat
     ],
 )
 def test_logs_begin_a_run_whose_controller_remembers(place: Path, tmp_path: Path, word: str) -> None:
-    words = command("data=logs/*.csv", f"out={tmp_path / 'run'}", "trials=1", word)
-    done = subprocess.run(words, cwd=place, capture_output=True, text=True)
+    words = words_of("data=logs/*.csv", f"out={tmp_path / 'run'}", "trials=1", word)
+    done = forked.command("train", *words, cwd=place)
     assert done.returncode == 0, done.stderr
     assert "trial  1/1  0.0 s of plant  3 episodes of logs" in done.stderr
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
+import forked
 import pegasus_jax as pg
 from pegasus_envs import mjcf_check, mjcf_plant
 from pegasus_envs.render import frames
@@ -97,8 +97,7 @@ def test_is_drawn_without_a_camera_of_its_own(pendulum: mjcf_plant.Mechanism) ->
 
 def command(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
     (cwd / "costs.py").write_text(COSTS)
-    program = [sys.executable, "-P", "-c", "from pegasus_jax.cli.main import train; train()"]
-    return subprocess.run([*program, *map(str, words)], cwd=cwd, capture_output=True, text=True, check=False)
+    return forked.command("train", *words, cwd=cwd)
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+import forked
 from pegasus_jax.runs import config_io, store
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "remote_robot"
@@ -201,11 +202,9 @@ WORDS += ["start_mean=[3.14,0]", "horizon=10"]
 
 
 def command(module: str, function: str, *words: str) -> subprocess.CompletedProcess[str]:
-    program = [sys.executable, "-P", "-c", f"from pegasus_jax.cli.{module} import {function}; {function}()", *words]
     path = f"{EXAMPLE}:{os.environ.get('PYTHONPATH', '')}"
-    return subprocess.run(
-        program, capture_output=True, text=True, check=False, env=os.environ | {"PYTHONPATH": path}, timeout=120
-    )
+    program = f"from pegasus_jax.cli.{module} import {function}; {function}()"
+    return forked.run(program, words, Path.cwd(), os.environ | {"PYTHONPATH": path})
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ import gymnasium
 import numpy as np
 import pytest
 
+import forked
 from benchmarks import once
 from pegasus_envs.gym_plant import env_spec
 from pegasus_jax import controller
@@ -67,9 +68,9 @@ def started(name: str, *words: object, cwd: Path, **environment: int) -> subproc
 
 
 def call(name: str, *words: object, cwd: Path, **environment: int) -> tuple[int, str, str]:
-    process = started(name, *words, cwd=cwd, **environment)
-    out, err = process.communicate(timeout=300)
-    return process.returncode, out, err
+    (cwd / "robot.py").write_text(ROBOT + WATCHED)
+    done = forked.command(name, *words, cwd=cwd, env={key: str(value) for key, value in environment.items()})
+    return done.returncode, done.stdout, done.stderr
 
 
 def asked(cwd: Path) -> list[str]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
@@ -12,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import forked
 from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.assembly.pieces import dynamics_of
@@ -98,10 +97,7 @@ def test_an_unknown_task_is_named() -> None:
 )
 def test_a_tiny_trial_through_the_command_line(words: list[str], tmp_path: Path) -> None:
     run = tmp_path / "run"
-    program = [sys.executable, "-c", "from pegasus_jax.cli.main import train; train()"]
-    done = subprocess.run(
-        [*program, *words, *TINY, f"out={run}"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = forked.command("train", *words, *TINY, f"out={run}", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     (row,) = store.trials(run)
     assert not row["random"]

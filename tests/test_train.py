@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import forked
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli.runs import evaluate
 from pegasus_jax.runs import checkpoint, config_io, store
@@ -29,8 +30,7 @@ def program(name: str) -> list[str]:
 
 
 def call(name: str, *words: object, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
-    command = [*program(name), *map(str, words)]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, env={**os.environ, **env})
+    return forked.command(name, *words, cwd=cwd, env=env)
 
 
 def fingerprint(run: Path) -> str:
@@ -43,7 +43,8 @@ def fingerprint(run: Path) -> str:
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An uninterrupted run."""
     run = tmp_path_factory.mktemp("runs") / "whole"
-    done = call("train", *TINY, f"out={run}", cwd=run.parent)
+    words = [*program("train"), *TINY, f"out={run}"]
+    done = subprocess.run(words, cwd=run.parent, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return run
 

@@ -1,0 +1,112 @@
+"""Commands in processes that begin with the packages that every command imports, which takes seconds, once for all.
+
+A process that has imported JAX and other packages, and nothing of ours, waits for commands and forks for each of them.
+What is forked has its own folder, environment, output and end, and imports all of our code itself. Commands that a test
+interrupts or kills, and those whose imports are what it is about, are started by subprocess instead.
+"""
+
+from __future__ import annotations
+
+import atexit
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import traceback
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+
+# Not MuJoCo, which looks for a display when it is imported, nor what only some commands need.
+PACKAGES = ("jax", "jax.experimental.multihost_utils", "flax.linen", "optax", "orbax.checkpoint")
+PACKAGES += ("omegaconf", "rich.console", "rich.live", "tensorboardX", "gymnasium", "filelock")
+# Variables that those packages, or Python, make use of when they begin.
+READ_AT_IMPORT = ("JAX_", "XLA_", "TF_", "OPENBLAS_", "PYTHON")
+Done = subprocess.CompletedProcess[str]
+spent: list[float] = []  # CPU seconds of each process that was forked: they are no children of this one
+
+
+def command(name: str, *words: object, cwd: Path, env: Mapping[str, str] | None = None) -> Done:
+    """A command of `pegasus_jax.cli.main`, such as `train`, until its end; `env` comes on top of this environment."""
+    return run(f"from pegasus_jax.cli.main import {name}; {name}()", words, cwd, {**os.environ, **(env or {})})
+
+
+def run(program: str, words: Sequence[object], cwd: Path, environment: Mapping[str, str]) -> Done:
+    """What `python -P -c program words` leaves, and has written; another environment than ours for JAX starts that."""
+    arguments = [sys.executable, "-P", "-c", program, *map(str, words)]
+    if sys.platform != "linux" or read_at_import(environment) != read_at_import(os.environ):
+        return subprocess.run(arguments, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    server = started(tuple(read_at_import(os.environ).items()))
+    assert server.stdin is not None
+    assert server.stdout is not None
+    with tempfile.TemporaryDirectory() as folder:
+        out, err = (Path(folder) / name for name in ("out", "err"))
+        asked = (program, arguments[4:], str(cwd), dict(environment), str(out), str(err))
+        print(json.dumps(asked), file=server.stdin, flush=True)
+        status, seconds = server.stdout.readline().split()
+        spent.append(float(seconds))
+        code = os.waitstatus_to_exitcode(int(status))
+        return subprocess.CompletedProcess(arguments, code, out.read_text(), err.read_text())
+
+
+def read_at_import(environment: Mapping[str, str]) -> dict[str, str]:
+    """The variables that come too late for packages that are imported already; PYTHONPATH does not."""
+    return {k: v for k, v in environment.items() if k.startswith(READ_AT_IMPORT) and k != "PYTHONPATH"}
+
+
+@cache
+def started(variables: tuple[tuple[str, str], ...]) -> subprocess.Popen[str]:
+    """The process that forks, one for all tests of this process that leave these variables as they are."""
+    del variables  # they are those of this process
+    program = f"import runpy; runpy.run_path({__file__!r})['serve']()"
+    pipes = dict(stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    server = subprocess.Popen([sys.executable, "-P", "-c", program], cwd=os.sep, **pipes)  # type: ignore[call-overload]
+    atexit.register(server.kill)
+    return server
+
+
+def serve() -> None:
+    """Fork for each line of the input, one after another, and say how it ended, and after how many CPU seconds."""
+    for name in PACKAGES:
+        import_module(name)
+    ours = [name for name in sys.modules if name.startswith("pegasus")]
+    threads = len(os.listdir("/proc/self/task"))
+    assert not ours, f"{ours}: what is forked imports these itself"
+    assert threads == 1, f"{threads} threads: what is forked would wait for those it does not have"
+    answers = os.fdopen(os.dup(1), "w")
+    while line := sys.stdin.readline():
+        process = os.fork()
+        if not process:
+            become(*json.loads(line))
+        _, status, used = os.wait4(process, 0)
+        print(status, used.ru_utime + used.ru_stime, file=answers, flush=True)
+
+
+def become(program: str, words: list[str], cwd: str, environment: dict[str, str], out: str, err: str) -> None:
+    """Be the process that was asked for, to its end."""
+    code = 1
+    try:
+        for path, number in ((os.devnull, 0), (out, 1), (err, 2)):
+            os.dup2(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), number)
+        os.chdir(cwd)
+        os.environ.clear()
+        os.environ.update(environment)
+        sys.path[:0] = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path]
+        sys.argv = ["-c", *words]
+        exec(compile(program, "<string>", "exec"), {"__name__": "__main__"})
+        code = 0
+    except SystemExit as end:
+        code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        if isinstance(end.code, str):
+            print(end.code, file=sys.stderr)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        try:
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:
+            os._exit(code)
