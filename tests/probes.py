@@ -105,6 +105,7 @@ def dial(horizon: int = 6) -> Task:
 
 # Of a search that neither restarts nor refines, for those who ask nothing of that: it compiles in half the time.
 PLAIN = dict(search__init="previous", search__refine_fraction=0.0)
+PLAIN_WORDS = ["search.init=previous", "search.refine_fraction=0", "search.visited_starts=0"]  # the same, of a command
 
 
 class Counter:

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from probes import PLAIN_WORDS
 from test_docs import blocks, commands, shell, tools  # noqa: F401 (tools is a fixture)
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -16,7 +17,9 @@ SCRIPTS = sorted(EXAMPLES.glob("*.py"))
 PAGES_HAVE_NOT = ("own_model_in_jit", "own_robot")  # what the others do, pages do too
 COMMANDS = [command for block in blocks(EXAMPLES / "README.md") for command in commands(block)]
 SMALL = "trials=2 fit=3 search=2"  # of a script's own words
-SETTINGS = "trials=2 fit.steps=3 search.steps=4 model.hidden=[8] policy.hidden=[8]"  # of a command
+SETTINGS = "trials=2 fit.steps=3 search.steps=4 model.hidden=[8] policy.hidden=[8] " + " ".join(
+    PLAIN_WORDS
+)  # of a command
 
 
 def cut(command: str) -> str:
