@@ -10,11 +10,13 @@ from __future__ import annotations
 import atexit
 import json
 import os
+import signal
 import subprocess
 import sys
 import tempfile
 import traceback
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -24,6 +26,7 @@ PACKAGES = ("jax", "jax.experimental.multihost_utils", "flax.linen", "optax", "o
 PACKAGES += ("omegaconf", "rich.console", "rich.live", "tensorboardX", "gymnasium", "filelock")
 # Variables that those packages, or Python, make use of when they begin.
 READ_AT_IMPORT = ("JAX_", "XLA_", "TF_", "OPENBLAS_", "PYTHON")
+LIMIT = 300.0  # seconds that a command may take before it fails its test; it takes a tenth of that on a busy machine
 Done = subprocess.CompletedProcess[str]
 spent: list[float] = []  # CPU seconds of each process that was forked: they are no children of this one
 
@@ -33,22 +36,53 @@ def command(name: str, *words: object, cwd: Path, env: Mapping[str, str] | None 
     return run(f"from pegasus_jax.cli.main import {name}; {name}()", words, cwd, {**os.environ, **(env or {})})
 
 
-def run(program: str, words: Sequence[object], cwd: Path, environment: Mapping[str, str]) -> Done:
-    """What `python -P -c program words` leaves, and has written; another environment than ours for JAX starts that."""
+def run(
+    program: str, words: Sequence[object], cwd: Path, environment: Mapping[str, str], *, limit: float = LIMIT
+) -> Done:
+    """What `python -P -c program words` leaves, and has written; another environment than ours for JAX starts that.
+
+    After `limit` seconds its whole process group is killed, and TimeoutError says what it had written.
+    """
     arguments = [sys.executable, "-P", "-c", program, *map(str, words)]
-    if sys.platform != "linux" or read_at_import(environment) != read_at_import(os.environ):
-        return subprocess.run(arguments, cwd=cwd, env=environment, capture_output=True, text=True, check=False)
+    begin = forked if sys.platform == "linux" and read_at_import(environment) == read_at_import(os.environ) else anew
+    with tempfile.TemporaryDirectory() as folder:
+        out, err = (Path(folder) / name for name in ("out", "err"))
+        code = begin(arguments, cwd, environment, out, err, limit)
+        written = [path.read_text(errors="replace") if path.exists() else "" for path in (out, err)]
+    if code is None:
+        raise TimeoutError("\n".join([f"killed after {limit} s: {arguments[3:]}", *written]))
+    return subprocess.CompletedProcess(arguments, code, *written)
+
+
+def forked(
+    arguments: list[str], cwd: Path, environment: Mapping[str, str], out: Path, err: Path, limit: float
+) -> int | None:
+    """How a process that is forked ended; None if it was killed."""
     server = started(tuple(read_at_import(os.environ).items()))
     assert server.stdin is not None
     assert server.stdout is not None
-    with tempfile.TemporaryDirectory() as folder:
-        out, err = (Path(folder) / name for name in ("out", "err"))
-        asked = (program, arguments[4:], str(cwd), dict(environment), str(out), str(err))
-        print(json.dumps(asked), file=server.stdin, flush=True)
-        status, seconds = server.stdout.readline().split()
-        spent.append(float(seconds))
-        code = os.waitstatus_to_exitcode(int(status))
-        return subprocess.CompletedProcess(arguments, code, out.read_text(), err.read_text())
+    asked = (limit, arguments[3], arguments[4:], str(cwd), dict(environment), str(out), str(err))
+    print(json.dumps(asked), file=server.stdin, flush=True)
+    status, seconds, killed = json.loads(server.stdout.readline())
+    spent.append(seconds)
+    return None if killed else os.waitstatus_to_exitcode(status)
+
+
+def anew(
+    arguments: list[str], cwd: Path, environment: Mapping[str, str], out: Path, err: Path, limit: float
+) -> int | None:
+    """The same of a process that begins by itself."""
+    with out.open("w") as stdout, err.open("w") as stderr:
+        told = dict(cwd=cwd, env=environment, stdin=subprocess.DEVNULL, stdout=stdout, stderr=stderr)
+        process = subprocess.Popen(arguments, start_new_session=True, **told)  # type: ignore[call-overload]
+        try:
+            return process.wait(limit)
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
 
 
 def read_at_import(environment: Mapping[str, str]) -> dict[str, str]:
@@ -77,17 +111,41 @@ def serve() -> None:
     assert threads == 1, f"{threads} threads: what is forked would wait for those it does not have"
     answers = os.fdopen(os.dup(1), "w")
     while line := sys.stdin.readline():
+        limit, *asked = json.loads(line)
         process = os.fork()
         if not process:
-            become(*json.loads(line))
+            become(*asked)
+        with suppress(PermissionError, ProcessLookupError):
+            os.setpgid(process, process)  # as it does itself: whichever comes first
+        print(json.dumps(ended(process, limit)), file=answers, flush=True)
+
+
+def ended(process: int, limit: float) -> tuple[int, float, bool]:
+    """Wait for a process, and kill its group after `limit` seconds: its status, CPU seconds, whether it was killed."""
+    late: list[int] = []
+
+    def kill(*_: object) -> None:
+        late.append(process)
+        os.killpg(process, signal.SIGKILL)
+
+    signal.signal(signal.SIGALRM, kill)
+    signal.setitimer(signal.ITIMER_REAL, limit)
+    try:
         _, status, used = os.wait4(process, 0)
-        print(status, used.ru_utime + used.ru_stime, file=answers, flush=True)
+    except KeyboardInterrupt:
+        kill()
+        raise
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+    return status, used.ru_utime + used.ru_stime, bool(late)
 
 
 def become(program: str, words: list[str], cwd: str, environment: dict[str, str], out: str, err: str) -> None:
     """Be the process that was asked for, to its end."""
     code = 1
     try:
+        os.setpgid(0, 0)
+        signal.signal(signal.SIGALRM, signal.SIG_DFL)
         for path, number in ((os.devnull, 0), (out, 1), (err, 2)):
             os.dup2(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), number)
         os.chdir(cwd)

@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -51,3 +52,20 @@ def test_its_cpu_time_is_counted(tmp_path: Path) -> None:
     forked.run("while __import__('time').process_time() < 0.5: pass", [], tmp_path, os.environ)
     if sys.platform == "linux":
         assert 0.3 < forked.spent[-1] < 5
+
+
+@pytest.mark.parametrize("environment", [{}, {"JAX_ENABLE_X64": "true"}], ids=["forked", "anew"])
+def test_what_hangs_is_killed_with_all_that_it_started(environment: dict[str, str], tmp_path: Path) -> None:
+    """It says what it had written, and the next one runs; what has ended in time was not killed."""
+    hangs = "import subprocess, time; print('begun', flush=True)"
+    hangs += "; subprocess.Popen(['sh', '-c', 'sleep 5; touch late']); time.sleep(60)"
+    given = ([], tmp_path, {**os.environ, **environment})
+    forked.run("", *given)  # the process that forks has begun
+    began = time.monotonic()
+    with pytest.raises(TimeoutError, match=r"killed after 3.0 s(.|\n)*\nbegun\n"):
+        forked.run(hangs, *given, limit=3.0)
+    killed = time.monotonic()
+    assert killed - began < 30
+    assert forked.run("print('next')", *given, limit=30.0).stdout == "next\n"
+    time.sleep(max(0.0, killed + 4 - time.monotonic()))
+    assert not (tmp_path / "late").exists()
