@@ -83,7 +83,7 @@ PEERS = (
 def pooled(row: Row, out: Path) -> Result:
     """The studies of a row as one, over all their seeds. Raises ValueError where their configs differ."""
     parts = [found for stem in row.studies if (found := read(out, stem)) is not None]
-    if len(parts) < len(row.studies) or any(changes(row, one) != changes(row, parts[0]) for one in parts):
+    if len(parts) < len(row.studies) or len({changes(row, one) for one in parts}) > 1:
         raise ValueError(f"the studies {', '.join(row.studies)} are not of one config, or one is missing")
     together = ("seeds", "mean_cost", "success_rate")
     return parts[0] | {name: [value for part in parts for value in part[name]] for name in together}

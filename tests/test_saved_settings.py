@@ -103,6 +103,26 @@ def test_a_run_from_before_a_setting_existed_goes_on_with_its_default(tmp_path):
     assert config_io.load(tmp_path / "config.yaml") == chosen
 
 
+@pytest.mark.parametrize("nth", range(max(map(len, config.KINDS.values()))))
+def test_a_value_that_is_a_settings_own_has_the_type_of_the_setting(nth, monkeypatch):
+    """As OmegaConf would make it, which is not asked; each kind of every section has its turn."""
+    kinds = {section: [*kinds.values()] for section, kinds in config.KINDS.items()}
+    chosen = Config(**{section: each[nth % len(each)] for section, each in kinds.items()})
+    stored = config_io.plain(chosen)
+    monkeypatch.setattr(config_io, "_same", lambda value, current: False)
+    converted = config_io.override(chosen, stored)
+    monkeypatch.undo()
+    assert repr(config_io.override(chosen, stored)) == repr(converted) == repr(chosen)
+
+
+@pytest.mark.parametrize(
+    ("value", "current", "expected"),
+    [(1, 1, True), (1, 1.0, False), (True, 1, False), ([1], (1,), True), ([1.0], (1,), False), ([1], (1, 2), False)],
+)
+def test_a_number_of_another_type_is_not_the_settings_own(value, current, expected):
+    assert config_io._same(value, current) is expected
+
+
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
 def test_what_was_parsed_survives_the_file(algorithm, tmp_path):
     chosen = parse(f"algorithm={algorithm}", "model=sparse", "policy=mlp", "policy.hidden=[3]", "seed=7")

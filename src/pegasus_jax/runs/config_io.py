@@ -226,11 +226,20 @@ def _changed(node: Any, changes: dict[str, Any], prefix: str) -> Any:
     return dataclasses.replace(node, **here)
 
 
+def _same(value: Any, current: Any) -> bool:
+    """Whether a value is what a setting has, its type too; a list is the tuple of its entries, as `plain` made it."""
+    if isinstance(value, list) and isinstance(current, tuple):
+        return len(value) == len(current) and all(map(_same, value, current))
+    return isinstance(value, str | int | float | None) and (type(value), value) == (type(current), current)
+
+
 def _converted(node: Any, name: str, value: Any, key: str) -> Any:
     """The value as the type of the dataclass's field of that name."""
     if "${" in str(value):  # OmegaConf would put another setting there, or a variable of the environment
         raise ConfigError(f"{key}={shown(value)} is not a value but a reference to one; write the value itself")
     current = getattr(node, name)
+    if _same(value, current):
+        return current  # OmegaConf would take 2 ms to find that out, for each of the settings that a run has kept
     if key in ONE_FOR_ALL and isinstance(value, int | float) and not isinstance(value, bool):
         value = [value]
     field = next(f for f in dataclasses.fields(node) if f.name == name)
