@@ -9,7 +9,7 @@ import tempfile
 import typing
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -104,6 +104,12 @@ def imagined() -> Imagined:
     return Imagined(POLICY.init(key()), posterior, pg.draw(key(), 0, posterior, blocks=blocks(), period=pg.Period()))
 
 
+@cache
+def drawn() -> Imagined:
+    """The same for tests that ask nothing of its numbers: as one program, and once."""
+    return jax.jit(imagined)()
+
+
 PIECES: dict[str, Any] = dict(dynamics=DYNAMICS, policy=POLICY, match=pg.matching.match)
 J = partial(pg.objective, **PIECES, cost=pg.costs.of_particles(TASK.cost))
 
@@ -149,14 +155,19 @@ def _() -> Any:
     twice = pg.Cost(lambda x: 2 * jnp.sum(x**2))
     own: dict[str, Any] = dict(dynamics=DYNAMICS, policy=POLICY, fitter=fitted, searcher=still, cost=twice)
     experiment = pg.compose(CONFIG, TASK, **own)
-    state = experiment.init(key())
-    assert jax.tree.structure(state.model.optimizer) == jax.tree.structure(fitted.init(state.model.params))
-    state = experiment.add_episode(state, experiment.collect(state))
-    searched, info = experiment.search(state)
-    assert info == "searched"
     assert experiment.task.cost.of_state(X) == pytest.approx(2 * float(X @ X))
-    assert experiment.imagine(searched)[1].shape == (H, K)
-    return experiment.fit(state)[1]
+
+    @jax.jit
+    def learned() -> Any:
+        state = experiment.init(key())
+        assert jax.tree.structure(state.model.optimizer) == jax.tree.structure(fitted.init(state.model.params))
+        state = experiment.add_episode(state, experiment.collect(state))
+        searched, info = experiment.search(state)
+        assert info == "searched"
+        assert experiment.imagine(searched)[1].shape == (H, K)
+        return experiment.fit(state)[1]
+
+    return learned()
 
 
 @example("run", "trial")
@@ -164,7 +175,11 @@ def _() -> Any:
     experiment = pg.compose(CONFIG, TASK)
     state, info = pg.run(experiment, 1, episodes=2)(key())
     assert info.evaluation.shape == (1, 2, H)
-    state, info = pg.trial(state, experiment, episodes=2)
+    shape = jax.eval_shape(partial(pg.trial, exp=experiment, episodes=2), state)  # `run` has just run one
+    assert [leaf.shape for leaf in jax.tree.leaves(shape)] == [
+        *(leaf.shape for leaf in jax.tree.leaves(state)),
+        *(leaf.shape[1:] for leaf in jax.tree.leaves(info)),
+    ]
     return state.data, info.evaluation, state.policy.params
 
 
@@ -243,7 +258,8 @@ def _() -> Any:
     assert pg.matching.keep(x, z) is x
     pieces = {**PIECES, "noise": pg.NoiseUse(state=1.0)}
     matches = (pg.matching.match, pg.matching.keep, pg.matching.narrow(angles=(0,)))
-    found = [pg.rollout(*imagined(), **{**pieces, "match": match}) for match in matches]
+    given = imagined()
+    found = [pg.rollout(*given, **{**pieces, "match": match}) for match in matches]
     assert all(one.x.shape == (H + 1, K, D) for one in found)
     assert pg.matching.wide(found[0].x, angles=(0,)).shape == (H + 1,)
     return found
@@ -287,7 +303,9 @@ def _() -> Any:
     assert isinstance(learner.optimizer, pg.SearchState)
     fresh = jax.vmap(POLICY.init)(jax.random.split(jax.random.key(1)))
     by_hand = pg.search(key(), learner, posterior, problem=problem, steps=2, fresh=fresh)
-    return by_hand[0].params, found.run(key(), learner, posterior, steps=2, fresh=fresh)[1]
+    again = jax.eval_shape(partial(found.run, steps=2), key(), learner, posterior, fresh=fresh)  # the same program
+    assert jax.tree.map(jnp.shape, again) == jax.tree.map(jnp.shape, by_hand)
+    return by_hand[0].params, by_hand[1]
 
 
 @example("preset")
@@ -311,8 +329,8 @@ def _() -> Any:
 
 
 def test_the_two_expectations_of_a_cost_agree() -> None:
-    closed = pg.costs.expectation(TASK.cost)
-    by_nodes = pg.costs.expectation(pg.Cost(TASK.cost.of_state))
+    costs = TASK.cost, pg.Cost(TASK.cost.of_state)
+    closed, by_nodes = (jax.jit(pg.costs.expectation(cost)) for cost in costs)
     mean, cov = X, jnp.array([[0.1, 0.05], [0.05, 0.2]])
     np.testing.assert_allclose(by_nodes(mean, cov), closed(mean, cov), atol=1e-3)
 
@@ -470,7 +488,7 @@ SCENARIOS = [
 
 @pytest.mark.parametrize(("part", "change", "message"), SCENARIOS)
 def test_a_rollout_names_the_part_of_the_scenarios_that_is_wrong(part: str, change: Any, message: str) -> None:
-    given = imagined()
+    given = drawn()
     wrong = given.scenarios._replace(**{part: change(given.scenarios)})
     with pytest.raises(ValueError, match=f"^{message}"):
         jax.eval_shape(partial(pg.rollout, **PIECES), given.params, given.posterior, wrong)
@@ -502,11 +520,11 @@ PIECES_THAT_ARE_WRONG = [
 @pytest.mark.parametrize(("piece", "wrong", "message"), PIECES_THAT_ARE_WRONG)
 def test_a_piece_of_your_own_that_answers_wrongly_is_named(piece: str, wrong: Any, message: str) -> None:
     with pytest.raises(ValueError, match=f"^{message}"):
-        jax.eval_shape(partial(J, **{piece: wrong}), *imagined())
+        jax.eval_shape(partial(J, **{piece: wrong}), *drawn())
 
 
 def test_a_learner_is_no_parameters() -> None:
-    params, *rest = imagined()
+    params, *rest = drawn()
     with pytest.raises(ValueError, match=r"policy_params is a TrainState; .*policy_params=learner\.params"):
         jax.eval_shape(partial(pg.rollout, **PIECES), pg.TrainState(params, ()), *rest)
 
@@ -601,8 +619,8 @@ def test_a_cost_picks_entries_by_an_array_also_where_compose_is_traced(entries: 
 
 
 def test_the_cost_of_a_task_is_one_of_an_objective() -> None:
-    given = imagined()
-    assert J(*given) == J(*given, cost=TASK.cost)
+    given = drawn()
+    assert jax.jit(J)(*given) == jax.jit(partial(J, cost=TASK.cost))(*given)
 
 
 WRONG_TASKS = [

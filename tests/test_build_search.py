@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from functools import partial
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +25,7 @@ from pegasus_jax.types import Cost, Dataset, TrainState
 from probes import PENDULUM, cart, known, linear_policy, tiny
 
 
+@cache  # many tests ask for the same one, such as the plain one: it is traced and compiled once
 def searcher(gain=-0.5, scatter=0.0, **search):
     """An experiment under a config, its first state, and a one-step search from it, which weighs no fresh policy."""
     plain = {"steps": 1, "particles": 5, "cost_estimator": "particles", "cost_width_start": 1.0, "init": "previous"}
@@ -182,7 +183,7 @@ def test_what_is_weighed_needs_no_second_program(monkeypatch):
 
     def times(**search):
         traced.clear()
-        exp, state, _ = searcher(steps=4, **search)
+        exp, state, _ = searcher.__wrapped__(steps=4, **search)
         jax.eval_shape(exp.search, state)
         return len(traced)
 
@@ -224,7 +225,7 @@ def test_a_cost_that_is_only_a_function_is_widened_as_well(stop):
         costs = (
             costs_of(config.Search(cost_estimator=of), t) for t in (task, task._replace(cost=Cost(task.cost.of_state)))
         )
-        known, own = (f(None, jnp.array(2.0))(x) for f in costs)
+        known, own = (jax.jit(lambda x, f=f: f(None, jnp.array(2.0))(x))(x) for f in costs)
         np.testing.assert_allclose(own, known, atol=near)
 
 

@@ -4,12 +4,12 @@ import json
 import os
 import re
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+import forked
 from benchmarks import RESULTS, results_page
 from benchmarks.paper import claims, comparison
 from benchmarks.paper.figures import Claim, Figure, read
@@ -44,10 +44,10 @@ trials = [1, 2]
 
 def paper(*words: str, cwd: Path, **env: str) -> subprocess.CompletedProcess[str]:
     """`python -m benchmarks.paper` in a folder of a user's."""
-    command = [sys.executable, "-m", "benchmarks.paper", *words]
+    program = "import runpy; runpy.run_module('benchmarks.paper', run_name='__main__', alter_sys=True)"
     path = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     env = {**os.environ, "PYTHONPATH": path, **env}
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=False, env=env)
+    return forked.run(program, words, cwd, env)
 
 
 def write_study(folder: Path, stem: str, cost: np.ndarray, **changes: object) -> None:

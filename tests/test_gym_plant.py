@@ -408,11 +408,12 @@ def test_what_did_not_take_place_costs_what_the_user_says() -> None:
     task = task_of("Terminates-v0", 1, horizon=6)._replace(stop_cost=0.7)
     np.testing.assert_allclose(episode.charged([0.1, 0.2], task), [0.1, 0.2, 0.7, 0.7, 0.7, 0.7])
     exp = compose(tiny(), task)
-    ran = exp.drive(jax.random.key(0), exp.init(jax.random.key(1)).policy.params, True)
+    state = jax.jit(exp.init)(jax.random.key(1))
+    ran = exp.drive(jax.random.key(0), state.policy.params, True)
     np.testing.assert_allclose(ran.trajectory.cost, [1.0, 4.0, 9.0])  # of the states 1, 2 and 3
-    whole = exp.episode(jax.random.key(0), exp.init(jax.random.key(1)).policy.params, True)
+    whole = exp.episode(jax.random.key(0), state.policy.params, True)
     assert (whole.x.shape, whole.u.shape, int(whole.length)) == ((7, 1), (6, 1), 3)
-    state = jax.jit(exp.add_episode)(exp.init(jax.random.key(1)), whole)
+    state = jax.jit(exp.add_episode)(state, whole)
     assert int(state.data.size) == 3
     np.testing.assert_array_equal(state.data.x[:, 0], [0, 1, 2, *[0] * (len(state.data.x) - 3)])
 

@@ -18,6 +18,7 @@ from benchmarks import once
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.runs import begin, checkpoint, config_io, store
 from pegasus_jax.runs.restore import restored
+from probes import PLAIN_WORDS
 
 TINY = "task=gym env=Pendulum-v1 cost=mymodule:cost horizon=8 trials=3 eval_episodes=1 explore.trials=0"
 TINY += " model.hidden=[8] policy.hidden=[8] fit.steps=5 search.steps=4 search.particles=8"
@@ -121,7 +122,7 @@ def test_another_run_begins_with_what_was_learned_from_logs(whole: Path, tmp_pat
     ],
 )
 def test_logs_begin_a_run_whose_controller_remembers(place: Path, tmp_path: Path, word: str) -> None:
-    words = words_of("data=logs/*.csv", f"out={tmp_path / 'run'}", "trials=1", word)
+    words = words_of("data=logs/*.csv", f"out={tmp_path / 'run'}", "trials=1", word, *PLAIN_WORDS)
     done = forked.command("train", *words, cwd=place)
     assert done.returncode == 0, done.stderr
     assert "trial  1/1  0.0 s of plant  3 episodes of logs" in done.stderr

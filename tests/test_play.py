@@ -77,7 +77,7 @@ def test_every_kind_of_plant_can_be_filmed(name: str, tmp_path: Path) -> None:
         plant = {"mjcf": str(tmp_path / "arm.xml"), "cost": "jax.numpy:sum", "dt": ".04", "horizon": "2"}
         words |= {"task": "mjcf", **plant}
     experiment = build(config_io.parse(words))
-    params = experiment.init(jax.random.key(0)).policy.params
+    params = jax.jit(lambda key: experiment.init(key).policy.params)(jax.random.key(0))  # and no model
     task = experiment.task._replace(horizon=2, cost=Cost(lambda x: x[0]))
     perform = jax.jit(partial(performance, task=task, policy=experiment.policy))
     _, states = perform(jax.random.key(1), params)

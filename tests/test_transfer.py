@@ -25,10 +25,11 @@ from pegasus_jax.runs.train import train
 from pegasus_jax.tasks.remembered import remembering
 from pegasus_jax.types import Batch, ModelLearner
 from pegasus_jax.vectorized import for_particles
-from probes import cart, experience, network, regression, same, tiny
+from probes import PLAIN, cart, experience, network, regression, same, tiny
 
 NETWORK = {"preset": "cartpole_network", "search__particles": "20"}
 SMALL = {"fit.steps": "2", "eval_episodes": "0", "trials": "1"}
+PLAIN_SEARCH = {name: str(value) for name, value in PLAIN.items()} | {"search__visited_starts": "0"}
 
 
 def simulate(x, u):
@@ -67,10 +68,10 @@ def test_a_residual_is_the_simulator_and_what_was_learned_within_what_was_seen(k
     """For one particle and for many, with an independent sum; its loss is that of the differences, which wrap."""
     learned, data = model(kind), experience()
     whole = residual(learned, simulate, angles=(2,))
-    params = whole.init(jax.random.key(0))
+    params = jax.jit(whole.init)(jax.random.key(0))
     given = jax.jit(whole.posterior)(params, data)
     x, u, keys = data.x[:7] * 1.1, data.u[:7], jax.random.split(jax.random.key(1), 7)
-    draws = jax.vmap(whole.sample, (0, None))(keys, given) if whole.deal is None else whole.deal(keys, given)
+    draws = jax.jit(whole.deal or jax.vmap(whole.sample, (0, None)))(keys, given)
     found = jax.jit(for_particles(whole.apply))(given, draws, x, u)
     stepped = jax.jit(jax.vmap(simulate))  # operation by operation it takes seconds
     change = np.array(stepped(x, u)) - np.array(x)
@@ -380,7 +381,7 @@ def test_a_run_with_a_simulator_is_used_without_it(tmp_path, monkeypatch):
     module.step = lambda x, u: x
     monkeypatch.setitem(__import__("sys").modules, "theirs", module)
     words = dict(prior="theirs:step", model="log_normal", model__hidden="[4]", trials="1", eval_episodes="0")
-    train(parse(**words), tmp_path / "run")
+    train(parse(**words, **PLAIN_SEARCH), tmp_path / "run")
     monkeypatch.delitem(__import__("sys").modules, "theirs")
     assert np.isfinite(pg.controller(tmp_path / "run")(np.zeros(4))).all()
     _, experiment, state = restore.restored(tmp_path / "run")
@@ -392,7 +393,7 @@ def test_the_goals_of_episodes_that_are_taken_over_are_kept(tmp_path):
     """For those of logs, which do not tell theirs, one is drawn, and a note says so."""
     config = replace(parse(trials="3"), cost=lambda x, goal: jnp.abs(x[0] - goal[0]))
     experiment = build(replace(config, goal_low=(-0.3,), goal_high=(0.3,)))
-    params = experiment.init(jax.random.key(0)).policy.params
+    params = jax.jit(lambda key: experiment.init(key).policy.params)(jax.random.key(0))  # and no model
     task, goal = experiment.task, experiment.task.memory.names.index("goal 0")
     for number in (1, 2):
         ran = jax.jit(experiment.episode)(jax.random.key(number), params, False)

@@ -14,7 +14,7 @@ from pegasus_jax.imagine.visited import STATES, Starts, Visited, beside_visited,
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.types import Dataset, RunState, Scenarios, TrainState
 from pegasus_jax.vectorized import for_particles
-from probes import cart, experience, network, regression, same, tiny
+from probes import cart, experience, network, regression, same, tiny, unchecked
 
 K, D = 2000, 3
 ALL = np.ones(D, bool)  # entries that differ between starts
@@ -112,9 +112,13 @@ def test_a_search_on_a_plant_of_ones_own_drops_what_is_too_steep(monkeypatch):
             task,
             cost=lambda x: factor * (1 + task.cost.of_state(x)),
         )
-        state = experiment.init(jax.random.key(0))
-        state = experiment.add_episode(state, experiment.collect(state))
-        return float(experiment.search(state)[1].gradient_norm[0])
+
+        @jax.jit
+        def searched(key):
+            state = experiment.init(key)
+            return experiment.search(experiment.add_episode(state, experiment.collect(state)))[1]
+
+        return float(searched(jax.random.key(0)).gradient_norm[0])
 
     usual = norm(10.0)
     assert norm(1e-3) < 0.9 * usual
@@ -139,11 +143,16 @@ def test_particles_with_a_goal_are_not_matched():
     def first(goal, **search):
         settings = dict(visited_starts=0.5, refine_fraction=0.5, cost_width_start=1.0) | search
         experiment = compose(tiny(**{f"search__{name}": value for name, value in settings.items()}), cart())
-        state = experiment.init(jax.random.key(0))
-        state = experiment.add_episode(state, experiment.collect(state))
-        y = state.data.y.at[:, 0].set(0.0) if goal else state.data.y
-        state = state._replace(data=state.data._replace(y=y))
-        return float(experiment.search(experiment.fit(state)[0])[1].objective[0])
+
+        @jax.jit
+        def searched(key, goal):
+            state = experiment.init(key)
+            state = experiment.add_episode(state, experiment.collect(state))
+            y = jnp.where(goal, state.data.y.at[:, 0].set(0.0), state.data.y)
+            state = state._replace(data=state.data._replace(y=y))
+            return experiment.search(experiment.fit(state)[0])[1]
+
+        return float(unchecked(searched)(jax.random.key(0), goal).objective[0])
 
     apart = dict(matching="never", cost_estimator="particles")
     assert first(goal=True, matching="always") == pytest.approx(first(goal=True, **apart), rel=1e-5)
