@@ -106,6 +106,13 @@ def test_a_comma_is_a_decimal_one_where_another_mark_is_between_cells(header, ma
     same(transitions(CART, str(path))[0])
 
 
+@pytest.mark.parametrize("mark", [", ", ",\t"])
+def test_what_follows_a_comma_between_cells_is_nothing(mark, tmp_path):
+    path, rows = tmp_path / "a.csv", np.rint(ROWS).astype(int)  # "1," between tabs could be a 1
+    path.write_text("\n".join(mark.join(map(str, row)) for row in [("v", "x", "u"), *rows[:, [1, 0, 2]]]))
+    same(transitions(CART, str(path))[0], rows)
+
+
 def test_a_control_is_the_one_sent_at_a_row_or_before_it(tmp_path):
     before = ROWS.copy()
     before[1:, 2], before[0, 2] = ROWS[:-1, 2], np.nan

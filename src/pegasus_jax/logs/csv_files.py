@@ -84,6 +84,6 @@ def _header(first: list[str], above: list[str], second: list[str], mark: str) ->
 def _number(cell: str, mark: str) -> float | None:
     """A cell's number, whose decimal mark may be a comma where none is between the cells; None: it is none."""
     try:
-        return float(cell if mark == "," else cell.replace(",", "."))
+        return float(cell if mark == "," or cell.endswith(",") else cell.replace(",", "."))
     except ValueError:
         return None
