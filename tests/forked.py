@@ -15,11 +15,12 @@ import subprocess
 import sys
 import tempfile
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cache
 from importlib import import_module
 from pathlib import Path
+from typing import Any, NoReturn
 
 # Not MuJoCo, which looks for a display when it is imported, nor what only some commands need.
 PACKAGES = ("jax", "jax.experimental.multihost_utils", "flax.linen", "optax", "orbax.checkpoint")
@@ -140,10 +141,10 @@ def ended(process: int, limit: float) -> tuple[int, float, bool]:
     return status, used.ru_utime + used.ru_stime, bool(late)
 
 
-def become(program: str, words: list[str], cwd: str, environment: dict[str, str], out: str, err: str) -> None:
+def become(program: str, words: list[str], cwd: str, environment: dict[str, str], out: str, err: str) -> NoReturn:
     """Be the process that was asked for, to its end."""
-    code = 1
-    try:
+
+    def work() -> None:
         os.setpgid(0, 0)
         signal.signal(signal.SIGALRM, signal.SIG_DFL)
         for path, number in ((os.devnull, 0), (out, 1), (err, 2)):
@@ -154,6 +155,15 @@ def become(program: str, words: list[str], cwd: str, environment: dict[str, str]
         sys.path[:0] = [path for path in environment.get("PYTHONPATH", "").split(os.pathsep) if path]
         sys.argv = ["-c", *words]
         exec(compile(program, "<string>", "exec"), {"__name__": "__main__"})
+
+    live(work)
+
+
+def live(work: Callable[[], Any]) -> NoReturn:
+    """The life of a process that is forked: `work`, then what an interpreter does at its end."""
+    code = 1
+    try:
+        work()
         code = 0
     except SystemExit as end:
         code = end.code if isinstance(end.code, int) else int(end.code is not None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
 import json
 import os
 import select
@@ -15,7 +14,9 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
+
+from tests.forked import live
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: a process that forks must have no other thread
 
@@ -118,10 +119,10 @@ def command(name: str, *words: object, cwd: Path, limit: float = 60.0, **options
     return forked(work, limit, **options)
 
 
-def _be_child(work: Callable[[], Any], out: int, err: int) -> None:
+def _be_child(work: Callable[[], Any], out: int, err: int) -> NoReturn:
     """The child's life: as an interpreter that does nothing but `work`."""
-    code = 1
-    try:
+
+    def begun() -> None:
         os.setpgid(0, 0)
         null = os.open(os.devnull, os.O_RDONLY)
         for target, source in ((0, null), (1, out), (2, err)):
@@ -129,20 +130,8 @@ def _be_child(work: Callable[[], Any], out: int, err: int) -> None:
         # A test may hold the others.
         sys.stdout, sys.stderr = (os.fdopen(file, "w", closefd=False) for file in (1, 2))
         work()
-        code = 0
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else 0 if end.code is None else 1
-        if isinstance(end.code, str):
-            print(end.code, file=sys.stderr)
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        try:
-            atexit._run_exitfuncs()
-            sys.stdout.flush()
-            sys.stderr.flush()
-        finally:
-            os._exit(code)
+
+    live(begun)
 
 
 def _wait(child: int, limit: float) -> tuple[int, bool]:
