@@ -10,6 +10,7 @@ from __future__ import annotations
 import atexit
 import json
 import os
+import select
 import signal
 import subprocess
 import sys
@@ -64,9 +65,9 @@ def forked(
     assert server.stdout is not None
     asked = (limit, arguments[3], arguments[4:], str(cwd), dict(environment), str(out), str(err))
     print(json.dumps(asked), file=server.stdin, flush=True)
-    status, seconds, killed = json.loads(server.stdout.readline())
+    code, seconds, killed = json.loads(server.stdout.readline())
     spent.append(seconds)
-    return None if killed else os.waitstatus_to_exitcode(status)
+    return None if killed else code
 
 
 def anew(
@@ -122,23 +123,18 @@ def serve() -> None:
 
 
 def ended(process: int, limit: float) -> tuple[int, float, bool]:
-    """Wait for a process, and kill its group after `limit` seconds: its status, CPU seconds, whether it was killed."""
-    late: list[int] = []
-
-    def kill(*_: object) -> None:
-        late.append(process)
-        os.killpg(process, signal.SIGKILL)
-
-    signal.signal(signal.SIGALRM, kill)
-    signal.setitimer(signal.ITIMER_REAL, limit)
+    """Wait for a process, and kill its group after `limit` seconds: its exit code, CPU seconds, whether that was so."""
+    handle = os.pidfd_open(process)
+    late = True  # also where the waiting is interrupted
     try:
-        _, status, used = os.wait4(process, 0)
-    except KeyboardInterrupt:
-        kill()
-        raise
+        late = not select.select([handle], [], [], limit)[0]
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-    return status, used.ru_utime + used.ru_stime, bool(late)
+        os.close(handle)
+        for send in (os.killpg, os.kill) if late else ():
+            with suppress(ProcessLookupError):  # it may have no group of its own yet
+                send(process, signal.SIGKILL)
+    _, status, used = os.wait4(process, 0)
+    return os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, late
 
 
 def become(program: str, words: list[str], cwd: str, environment: dict[str, str], out: str, err: str) -> NoReturn:
@@ -146,7 +142,6 @@ def become(program: str, words: list[str], cwd: str, environment: dict[str, str]
 
     def work() -> None:
         os.setpgid(0, 0)
-        signal.signal(signal.SIGALRM, signal.SIG_DFL)
         for path, number in ((os.devnull, 0), (out, 1), (err, 2)):
             os.dup2(os.open(path, os.O_RDWR | os.O_CREAT, 0o600), number)
         os.chdir(cwd)

@@ -104,8 +104,11 @@ def dial(horizon: int = 6) -> Task:
 
 
 # Of a search that neither restarts nor refines, for those who ask nothing of that: it compiles in half the time.
-PLAIN = dict(search__init="previous", search__refine_fraction=0.0)
-PLAIN_WORDS = ["search.init=previous", "search.refine_fraction=0", "search.visited_starts=0"]  # the same, of a command
+PLAIN = dict(search__init="previous", search__refine_fraction=0.0, search__visited_starts=0.0)
+PLAIN_WORDS = [f"{name.replace('__', '.')}={value}" for name, value in PLAIN.items()]  # the same, of a command
+# Of a command that asks nothing of how well it learns.
+TINY_WORDS = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16"]
+TINY_WORDS += PLAIN_WORDS
 
 
 class Counter:

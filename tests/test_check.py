@@ -18,7 +18,7 @@ from pegasus_jax.cli.train import understood
 from pegasus_jax.config import Config, Explore
 from pegasus_jax.runs import check
 from pegasus_jax.tasks.cost_check import Facts
-from probes import PLAIN_WORDS, cart
+from probes import TINY_WORDS, cart
 
 ROBOT = """
 import gymnasium, numpy as np, jax.numpy as jnp
@@ -68,8 +68,7 @@ for kind in (Arm, Degrees, Fails, Twice):
     gymnasium.register(f"{kind.__name__}-v0", kind)
 """
 WORDS = ["task=gym", "angles=[0]", "horizon=5", "eval_episodes=0"]
-TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=1"]
-TINY += PLAIN_WORDS
+TINY = [*TINY_WORDS, "trials=1"]
 
 
 def call(name: str, *words: str, cwd: Path) -> tuple[int, str, list[str]]:

@@ -17,9 +17,8 @@ SCRIPTS = sorted(EXAMPLES.glob("*.py"))
 PAGES_HAVE_NOT = ("own_model_in_jit", "own_robot")  # what the others do, pages do too
 COMMANDS = [command for block in blocks(EXAMPLES / "README.md") for command in commands(block)]
 SMALL = "trials=2 fit=3 search=2"  # of a script's own words
-SETTINGS = "trials=2 fit.steps=3 search.steps=4 model.hidden=[8] policy.hidden=[8] " + " ".join(
-    PLAIN_WORDS
-)  # of a command
+# Of a command.
+SETTINGS = " ".join(["trials=2 fit.steps=3 search.steps=4 model.hidden=[8] policy.hidden=[8]", *PLAIN_WORDS])
 
 
 def cut(command: str) -> str:

@@ -28,10 +28,9 @@ from pegasus_jax.start import preset
 from pegasus_jax.task import Task
 from pegasus_jax.tasks import assumed
 from pegasus_jax.types import Cost
-from probes import PLAIN_WORDS, cart, tiny
+from probes import TINY_WORDS, cart, tiny
 
-TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
-TINY += PLAIN_WORDS
+TINY = [*TINY_WORDS, "trials=2"]
 COSTS = """
 import jax.numpy as jnp
 

@@ -23,10 +23,9 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config, label
 from pegasus_jax.runs import check, config_io, store
 from pegasus_jax.tasks import assumed
-from probes import PLAIN_WORDS
+from probes import TINY_WORDS
 
-TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
-TINY += PLAIN_WORDS
+TINY = [*TINY_WORDS, "trials=2"]
 PENDULUM = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "inverted_pendulum.xml"
 COSTS = "import jax.numpy as jnp\ndef upright(x):\n    return 1 - jnp.exp(-(x[0] ** 2 + x[1] ** 2))\n"
 ARM = """<mujoco><option density="{density}"/><worldbody><body><joint name="elbow" type="hinge" axis="0 1 0"/>

@@ -20,7 +20,7 @@ import pytest
 
 import forked
 from pegasus_jax.runs import config_io, store
-from probes import PLAIN_WORDS
+from probes import TINY_WORDS
 
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "remote_robot"
 NAMES = ("messages", "robot_side", "remote_robot")
@@ -197,8 +197,7 @@ def test_another_answer_than_the_one_asked_for_is_refused(sides: Any) -> None:
 
 # Whole commands
 
-TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
-TINY += PLAIN_WORDS
+TINY = [*TINY_WORDS, "trials=2"]
 WORDS = ["task=gym", "env=remote_robot:Remote-v0", "cost=remote_robot:cost", "angles=[0]", "eval_episodes=0"]
 WORDS += ["start_mean=[3.14,0]", "horizon=10"]
 

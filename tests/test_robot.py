@@ -24,7 +24,7 @@ from pegasus_jax.runs import config_io, groups, store, study
 from pegasus_jax.runs.restore import restored
 from pegasus_jax.runs.store import RunError
 from pegasus_jax.viz.learning_curves import groups_picture
-from probes import PLAIN_WORDS
+from probes import TINY_WORDS
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "robot.md").read_text(), re.DOTALL)
@@ -57,8 +57,7 @@ class Watched(Arm):
 gymnasium.register("Watched-v0", Watched)
 """
 WORDS = ["task=gym", "env=robot:Watched-v0", "cost=robot:cost", "angles=[0]", "start_mean=[3.14,0]", "eval_episodes=0"]
-TINY = ["model.hidden=[8]", "policy.hidden=[8]", "search.steps=5", "fit.steps=5", "search.particles=16", "trials=2"]
-TINY += PLAIN_WORDS
+TINY = [*TINY_WORDS, "trials=2"]
 PROGRAM = [sys.executable, "-P", "-c"]
 
 

@@ -29,7 +29,7 @@ from probes import PLAIN, cart, experience, network, regression, same, tiny
 
 NETWORK = {"preset": "cartpole_network", "search__particles": "20"}
 SMALL = {"fit.steps": "2", "eval_episodes": "0", "trials": "1"}
-PLAIN_SEARCH = {name: str(value) for name, value in PLAIN.items()} | {"search__visited_starts": "0"}
+PLAIN_SEARCH = {name: str(value) for name, value in PLAIN.items()}
 
 
 def simulate(x, u):

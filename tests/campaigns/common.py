@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import shlex
 import shutil
-import signal
 import sys
 import tempfile
 import time
@@ -16,7 +14,7 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, NoReturn
 
-from tests.forked import live
+from tests.forked import ended, live
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy: a process that forks must have no other thread
 
@@ -97,7 +95,7 @@ def forked(work: Callable[[], Any], limit: float, kill_after: float | None = Non
         child = os.fork()
         if not child:
             _be_child(work, out.fileno(), err.fileno())
-        status, late = _wait(child, limit if kill_after is None else min(limit, kill_after))
+        status, _, late = ended(child, limit if kill_after is None else min(limit, kill_after))
         texts = []
         for file in (out, err):
             file.seek(0)
@@ -132,22 +130,6 @@ def _be_child(work: Callable[[], Any], out: int, err: int) -> NoReturn:
         work()
 
     live(begun)
-
-
-def _wait(child: int, limit: float) -> tuple[int, bool]:
-    """Status of the child, and whether it had to be killed because its time was over."""
-    handle = os.pidfd_open(child)
-    try:
-        late = not select.select([handle], [], [], limit)[0]
-    finally:
-        os.close(handle)
-    if late:
-        for send in (os.killpg, os.kill):
-            try:
-                send(child, signal.SIGKILL)
-            except ProcessLookupError:
-                continue
-    return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), late
 
 
 def shared(cases: Sequence[Any], work: Callable[[Any], dict[str, Any]], jobs: int) -> list[dict[str, Any]]:
