@@ -110,6 +110,7 @@ def test_a_search_on_a_plant_of_ones_own_drops_what_is_too_steep(monkeypatch):
                 search__visited_starts=0.5, search__refine_fraction=0.5, search__steps=4, search__cost_width_start=1.0
             ),
             task,
+            dynamics=regression(2, 1),
             cost=lambda x: factor * (1 + task.cost.of_state(x)),
         )
 
@@ -142,7 +143,8 @@ def test_particles_with_a_goal_are_not_matched():
 
     def first(goal, **search):
         settings = dict(visited_starts=0.5, refine_fraction=0.5, cost_width_start=1.0) | search
-        experiment = compose(tiny(**{f"search__{name}": value for name, value in settings.items()}), cart())
+        config = tiny(**{f"search__{name}": value for name, value in settings.items()}, search__steps=4)
+        experiment = compose(config, cart(), dynamics=regression(2, 1))
 
         @jax.jit
         def searched(key, goal):
@@ -150,7 +152,7 @@ def test_particles_with_a_goal_are_not_matched():
             state = experiment.add_episode(state, experiment.collect(state))
             y = jnp.where(goal, state.data.y.at[:, 0].set(0.0), state.data.y)
             state = state._replace(data=state.data._replace(y=y))
-            return experiment.search(experiment.fit(state)[0])[1]
+            return experiment.search(state)[1]
 
         return float(unchecked(searched)(jax.random.key(0), goal).objective[0])
 
