@@ -29,7 +29,7 @@ setup: $(STAMP) ## make .venv with the locked dependencies and this project (aga
 train: $(STAMP) ## learn the cart-pole swing-up; settings: make train ARGS="trials=3 seed=1"
 	$(BIN)/pegasus-train $(if $(filter task=% resume=% --help -h,$(ARGS)),,task=cartpole) $(ARGS)
 
-test: $(STAMP) ## run the quick tests on JOBS=2 cores, within 8 minutes; some of them: make test ARGS="-k layers"
+test: $(STAMP) ## run the quick tests on JOBS=2 cores, within 15 minutes; some of them: make test ARGS="-k layers"
 	$(PYTEST) -m "not slow and not campaign" $(ARGS)
 
 test-slow: $(STAMP) ## run the tests that make test leaves out: whole runs, kills, the pages of docs/, short campaigns
