@@ -24,10 +24,11 @@ def chained(key, first, **pieces):
     """The scenarios of STEPS iterations, as a search redraws them one after the other."""
 
     def step(held, i):
-        return scenarios.redraw(key, i + 1, held, jnp.uint32(1), **pieces), held
+        held = scenarios.redraw(key, i, held, jnp.uint32(1), i == first, **pieces)
+        return held, held
 
-    held = scenarios.draw(key, first, jnp.uint32(1), **pieces)
-    return jax.lax.scan(step, held, first + jnp.arange(STEPS))[1]
+    begun = scenarios.begin(key, first, jnp.uint32(1), **pieces)
+    return jax.lax.scan(step, begun, first + jnp.arange(STEPS))[1]
 
 
 def naive(key, first, **pieces):
@@ -49,6 +50,15 @@ def test_periods(period, seed, first):
             seen.setdefault((block, i // every if every else 0), []).append(value.tobytes())
     assert all(len(set(values)) == 1 for values in seen.values())
     assert len({values[0] for values in seen.values()}) == len(seen)
+
+
+def test_a_block_of_random_keys_is_held_as_any_other():
+    """A policy of one's own may draw the key that it acts with."""
+    keys = PLAIN._replace(policy=lambda key, posterior: jax.random.split(key, 2))
+    for period in (Period(policy=3), Period(policy=0)):
+        pieces = dict(blocks=keys, period=period)
+        ours, expected = jax.jit(lambda key: (chained(key, 2, **pieces), naive(key, 2, **pieces)))(jax.random.key(0))  # noqa: B023
+        assert same(jax.random.key_data(ours.policy), jax.random.key_data(expected.policy))
 
 
 def test_the_belief_of_the_day_reaches_the_draws():

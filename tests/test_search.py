@@ -176,7 +176,7 @@ def test_a_known_control_is_found_through_limits_and_costs():
         jax.random.key(0),
         TrainState(jnp.zeros(1), optimizer.init(jnp.zeros(1))),
         None,
-        sampler=Sampler(lambda *_: jnp.zeros(()), lambda key, step, held, posterior: held),
+        sampler=Sampler(lambda *_: jnp.zeros(()), lambda key, step, held, posterior, begins: held),
         objective=lambda params, posterior, given: cost_of(2 * jnp.tanh(params)),
         optimizer=optimizer,
         steps=200,
@@ -206,7 +206,7 @@ def pursue(optimizer, steps, *, bad=(), value=jnp.nan, scale=1.0):
     return jax.jit(
         partial(
             gradient_search,
-            sampler=Sampler(draw, lambda key, step, held, posterior: draw(key, step, posterior)),
+            sampler=Sampler(draw, lambda key, step, held, posterior, begins: draw(key, step, posterior)),
             objective=distance,
             optimizer=optimizer,
             steps=steps,
@@ -241,7 +241,7 @@ def test_the_search_is_gradient_descent_on_the_scenarios_of_each_iteration():
 
 def on_table(table, optimizer, draw=follow, value=distance, **more):
     """(searcher of a table, its learner at ones); the objective ignores the row unless `value` takes it."""
-    drawing = Sampler(draw, lambda key, step, held, posterior: draw(key, step, posterior))
+    drawing = Sampler(draw, lambda key, step, held, posterior, begins: draw(key, step, posterior))
     found = searcher(Problem(value, drawing, optimizer, table, **more))
     return found, TrainState(jnp.ones(3), found.init(jnp.ones(3)))
 

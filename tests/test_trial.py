@@ -242,7 +242,7 @@ def test_no_two_purposes_trials_or_iterations_share_a_key():
     )
     unchecked(jax.jit(run(exp, 2, 3)))(jax.random.key(0))
     jax.effects_barrier()
-    searched = 2 * (3 + 1) * 2 * 5  # trials, iterations and the one after, model and policy, particles
+    searched = 2 * 3 * 2 * 5  # trials, iterations, model and policy, particles
     episodes = 2 * (1 + 3) * (1 + 3)  # trials, collected and evaluated, a reset and the policy's draws
     fresh = 2 * 2  # two policies that a search may begin with, in each trial
     assert len(seen) == 2 + 2 * 4 + fresh + searched + episodes

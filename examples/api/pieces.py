@@ -192,7 +192,7 @@ assert (scenarios.start.shape, scenarios.match.shape) == ((K, D), (H, K, D))
 draws = pg.sampler(parts, period)
 
 # Sampler
-assert jax.eval_shape(draws.draw, key, jnp.asarray(3), posterior).sensor.shape == (H, K, D)
+assert jax.eval_shape(draws.begin, key, jnp.asarray(3), posterior).sensor.shape == (H, K, D)
 
 # rollout
 imagined = jax.jit(partial(pg.rollout, dynamics=dynamics, policy=policy, match=pg.matching.match))

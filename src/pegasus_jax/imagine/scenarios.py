@@ -77,22 +77,38 @@ def draw(key: Key, step: Array | int, posterior: Params, *, blocks: Blocks, peri
     return Scenarios(*(sample(keys[i], posterior) for i, sample in enumerate(blocks)))
 
 
+def begin(key: Key, step: Array, posterior: Params, *, blocks: Blocks, period: Period) -> Scenarios:
+    """What a loop that redraws in each round has before its first: the blocks that last a search, zeros of the others.
+
+    So its program has one way to draw each block.
+    """
+    drawing = partial(draw, blocks=blocks, period=period)
+    nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(drawing, key, step, posterior))
+    if lasting := [name for name, every in zip(Scenarios._fields, period, strict=True) if not every]:
+        drawn = drawing(key, step, posterior)  # the blocks not asked for are dead code
+        return nothing._replace(**{name: getattr(drawn, name) for name in lasting})
+    return nothing
+
+
 def redraw(
-    key: Key, step: Array, scenarios: Scenarios, posterior: Params, *, blocks: Blocks, period: Period
+    key: Key, step: Array, scenarios: Scenarios, posterior: Params, begins: Array, *, blocks: Blocks, period: Period
 ) -> Scenarios:
-    """`draw` for an iteration, from those of it or of the one before; draws only the blocks that may change."""
+    """`draw` for an iteration, from those of it or of the one before; draws only the blocks that may change.
+
+    Where a loop `begins`, [], `scenarios` are what `begin` says.
+    """
     renewed = {}
     for every in sorted(set(period) - {0}):
         names = [name for name, p in zip(Scenarios._fields, period, strict=True) if p == every]
 
         def fresh(names: list[str] = names) -> dict[str, Params]:
-            drawn = draw(key, step, posterior, blocks=blocks, period=period)  # the blocks not asked for are dead code
+            drawn = draw(key, step, posterior, blocks=blocks, period=period)
             return {name: getattr(drawn, name) for name in names}
 
         def held(names: list[str] = names) -> dict[str, Params]:
             return {name: getattr(scenarios, name) for name in names}
 
-        renewed |= fresh() if every == 1 else jax.lax.cond(step % every == 0, fresh, held)
+        renewed |= fresh() if every == 1 else jax.lax.cond(begins | (step % every == 0), fresh, held)
     return scenarios._replace(**renewed)
 
 
@@ -103,10 +119,11 @@ def _epoch(step: Array | int, every: int) -> Array:
 class Sampler(NamedTuple):
     """Where the scenarios of a search come from."""
 
-    draw: Callable[[Key, Array, Params], Scenarios]  # (key, iteration, posterior)
-    redraw: Callable[[Key, Array, Scenarios, Params], Scenarios]  # (key, iteration, those before it, posterior)
+    begin: Callable[[Key, Array, Params], Scenarios]  # (key, first iteration, posterior) -> what a loop begins with
+    # (key, iteration, those before it, posterior, whether the loop begins) -> those in force
+    redraw: Callable[[Key, Array, Scenarios, Params, Array], Scenarios]
 
 
 def sampler(blocks: Blocks, period: Period) -> Sampler:
     """Scenarios drawn from `blocks`, each held for its `period` of iterations."""
-    return Sampler(*(partial(function, blocks=blocks, period=period) for function in (draw, redraw)))
+    return Sampler(*(partial(function, blocks=blocks, period=period) for function in (begin, redraw)))

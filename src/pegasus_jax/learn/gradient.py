@@ -43,13 +43,14 @@ def gradient_search(
 
     def step(carry: tuple[TrainState, Scenarios], i: Array) -> tuple[tuple[TrainState, Scenarios], SearchInfo]:
         learner, scenarios = carry
+        scenarios = sampler.redraw(key, i, scenarios, posterior, i == first)
         value, gradient = jax.value_and_grad(objective)(learner.params, posterior, scenarios)
         finite = is_finite((value, gradient))
         updates, state = update_if(finite, optimizer, gradient, learner, value=value)
         learner = TrainState(optax.apply_updates(learner.params, updates), state)
         info = SearchInfo(value, optax.tree.norm(gradient), ~finite)
-        return (learner, sampler.redraw(key, i + 1, scenarios, posterior)), info
+        return (learner, scenarios), info
 
-    begun = learner, sampler.draw(key, jnp.asarray(first, jnp.int32), posterior)
+    begun = learner, sampler.begin(key, jnp.asarray(first, jnp.int32), posterior)
     (learner, _), info = jax.lax.scan(step, begun, first + jnp.arange(steps, dtype=jnp.int32))
     return learner, info._replace(skipped=jnp.sum(info.skipped))

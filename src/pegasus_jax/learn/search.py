@@ -65,7 +65,6 @@ def search(
     if (asks := FRESH in table.candidate) and fresh is None:  # one that no row asks for is not drawn
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
     rows = of_search(table, earlier)
-    following = jnp.append(rows.scenarios[1:], rows.scenarios[-1:] + 1)  # no key is drawn from twice
     learner = optax.tree.where(jnp.asarray(first) == 0, renewed(problem, learner), learner)
     # Where nothing refines nothing is skipped. Without a word of what works all begin at 0: seeds side by side then
     # have one number, and one loop.
@@ -83,15 +82,15 @@ def search(
         now: SearchTable = jax.tree.map(lambda column: column[row + k], rows)
         learner, i = entered(now, learner, problem.optimizer), now.iteration - offset
         visited = candidate(now, learner, fresh if asks else None)
+        scenarios = sampler.redraw(key, now.scenarios, scenarios, posterior, k == 0)
         value, gradient, weight = valued(problem, learner.optimizer, visited, posterior, scenarios, now)
         learner, cost, skipped = after(now, learner, visited, value, gradient, weight, problem)
         norm, stepped = optax.tree.norm(gradient), jnp.where(now.action == STEP, i, steps)
-        scenarios = sampler.redraw(key, following[row + k], scenarios, posterior)
         norms = info.gradient_norm.at[stepped].set(norm, mode="drop")
         found = SearchInfo(info.objective.at[i].set(cost), norms, info.skipped + skipped, i + 1)
         return k + 1, learner, scenarios, found
 
-    scenarios, none = sampler.draw(key, jnp.asarray(offset, jnp.int32), posterior), jnp.full(steps, jnp.nan)
+    scenarios, none = sampler.begin(key, offset, posterior), jnp.full(steps, jnp.nan)
     begun = jnp.int32(0), learner, scenarios, SearchInfo(none, none, jnp.int32(0), jnp.int32(0))
     _, learner, _, info = jax.lax.while_loop(going, visit, begun)
     return learner, info
