@@ -84,10 +84,7 @@ def begin(key: Key, step: Array, posterior: Params, *, blocks: Blocks, period: P
     """
     drawing = partial(draw, blocks=blocks, period=period)
     nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(drawing, key, step, posterior))
-    if lasting := [name for name, every in zip(Scenarios._fields, period, strict=True) if not every]:
-        drawn = drawing(key, step, posterior)  # the blocks not asked for are dead code
-        return nothing._replace(**{name: getattr(drawn, name) for name in lasting})
-    return nothing
+    return nothing._replace(**_of_period(0, drawing(key, step, posterior), period)) if 0 in period else nothing
 
 
 def redraw(
@@ -99,17 +96,21 @@ def redraw(
     """
     renewed = {}
     for every in sorted(set(period) - {0}):
-        names = [name for name, p in zip(Scenarios._fields, period, strict=True) if p == every]
 
-        def fresh(names: list[str] = names) -> dict[str, Params]:
-            drawn = draw(key, step, posterior, blocks=blocks, period=period)
-            return {name: getattr(drawn, name) for name in names}
+        def fresh(every: int = every) -> dict[str, Params]:
+            return _of_period(every, draw(key, step, posterior, blocks=blocks, period=period), period)
 
-        def held(names: list[str] = names) -> dict[str, Params]:
-            return {name: getattr(scenarios, name) for name in names}
+        def held(every: int = every) -> dict[str, Params]:
+            return _of_period(every, scenarios, period)
 
         renewed |= fresh() if every == 1 else jax.lax.cond(begins | (step % every == 0), fresh, held)
     return scenarios._replace(**renewed)
+
+
+def _of_period(every: int, scenarios: Scenarios, period: Period) -> dict[str, Params]:
+    """The blocks that are drawn every so many iterations; of those just drawn the others are dead code."""
+    blocks = zip(Scenarios._fields, scenarios, period, strict=True)
+    return {name: block for name, block, lasts in blocks if lasts == every}
 
 
 def _epoch(step: Array | int, every: int) -> Array:
