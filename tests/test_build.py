@@ -321,3 +321,24 @@ def test_the_settings_of_pilcos_search_reach_its_objective():
     own = value(cart(horizon=3)._replace(cost=Cost(lambda x: -jnp.expm1(-x @ x / 2))))
     assert own != plain
     assert own == pytest.approx(plain, rel=0.01)
+
+
+WITHIN = {
+    "cart-pole": {},
+    "positions": {"sensors": config.Sensors(measured=(0, 3), velocity="difference", delay=1)},
+    "constraint": {"constraint": lambda x: jnp.abs(x[0]) - 2},
+    "reference": {"reference": lambda t: jnp.sin(t), "cost": lambda x, reference: (x[0] - reference[0]) ** 2},
+}
+
+
+@pytest.mark.parametrize("what", WITHIN)
+def test_an_experiment_that_was_built_inside_a_program_is_of_use_in_others(what):
+    """`build` keeps what it makes: nothing of it may belong to the program that was traced around the first call."""
+    own = tiny(trials=1, task="cartpole", fit__steps=2, search__steps=2, **WITHIN[what])
+
+    def cost(key: jax.Array) -> jax.Array:
+        experiment = build(own)
+        return experiment.collect(experiment.init(key)).cost
+
+    assert jax.eval_shape(cost, jax.random.key(0)).shape == (25,)
+    assert np.isfinite(cost(jax.random.key(0))).all()

@@ -53,7 +53,8 @@ def build(config: settings.Config, mesh: Mesh | None = None, logged: int = 0) ->
 
 @lru_cache(maxsize=64)
 def _built(config: settings.Config, mesh: Mesh | None, logged: int) -> Experiment:
-    return assembled(config, _posed(config), mesh, logged)
+    with tasks.outside():  # what is kept for other callers is of no program that is traced around this
+        return assembled(config, _posed(config), mesh, logged)
 
 
 @lru_cache(maxsize=64)

@@ -20,6 +20,7 @@ from pegasus_jax.tasks import circled, constrained, guide, priors, sensed, terms
 from pegasus_jax.tasks.own_plants import TASKS
 from pegasus_jax.tasks.signals import FILES, named, with_signals
 from pegasus_jax.tasks.starts import from_starts
+from pegasus_jax.tasks.traceable import outside as outside
 from pegasus_jax.tasks.traceable import whole as whole
 from pegasus_jax.types import Cost
 
@@ -61,12 +62,13 @@ def make(name: str, legs: int = 2, constants: Sequence[str] = ()) -> Task:
 
 def of_config(config: Config) -> Task:
     """The task that a config names."""
-    task = sensed.sensed(with_signals(unsensed(config), config), config.sensors)
-    return task._replace(
-        constraint=constrained.of_config(config, task),
-        guide=guide.of_config(config, task),
-        prior=priors.of_config(config, task),
-    )
+    with outside():  # it may be made while a program of its user's is traced
+        task = sensed.sensed(with_signals(unsensed(config), config), config.sensors)
+        return task._replace(
+            constraint=constrained.of_config(config, task),
+            guide=guide.of_config(config, task),
+            prior=priors.of_config(config, task),
+        )
 
 
 def unsensed(config: Config) -> Task:
@@ -95,8 +97,7 @@ def known_sensors(task: Task) -> np.ndarray:
     if not np.any(task.sensor_std):
         raise ConfigError(
             f"search.observation_noise=plant needs a plant whose sensors' noise is known,"
-            f" and that of task={task.name} is not;"
-            " the nearest is search.observation_noise=model"
+            f" and that of task={task.name} is not; the nearest is search.observation_noise=model"
         )
     return np.asarray(task.sensor_std, float)
 

@@ -1,10 +1,11 @@
-"""Whether JAX can trace what somebody wrote of a task: asked when it is composed, so that one line says where not."""
+"""A task and what JAX traces: whether it can, so that one line says where not, and what is made while it does."""
 
-from contextlib import suppress
+from contextlib import AbstractContextManager, nullcontext, suppress
 from inspect import unwrap
 
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 
 from pegasus_jax.checks import RunError, shown
 from pegasus_jax.task import Task
@@ -26,3 +27,11 @@ def whole(task: Task, cost: Cost | None = None) -> Task:
             with blamed(f"{name}={shown(unwrap(function))}", function), suppress(RunError):
                 jax.eval_shape(function, x)
     return made
+
+
+def outside() -> AbstractContextManager[None]:
+    """What is made within is computed now, and belongs to no program that is traced around it.
+
+    Where none is there is nothing to do: JAX compiles again within such a context, which takes MJX seconds.
+    """
+    return jax.ensure_compile_time_eval() if isinstance(jnp.zeros(()), Tracer) else nullcontext()
