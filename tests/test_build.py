@@ -334,7 +334,7 @@ WITHIN = {
 @pytest.mark.parametrize("what", WITHIN)
 def test_an_experiment_that_was_built_inside_a_program_is_of_use_in_others(what):
     """`build` keeps what it makes: nothing of it may belong to the program that was traced around the first call."""
-    own = tiny(trials=1, task="cartpole", fit__steps=2, search__steps=2, **WITHIN[what])
+    own = tiny(trials=1, task="cartpole", **WITHIN[what])
 
     def cost(key: jax.Array) -> jax.Array:
         experiment = build(own)
