@@ -18,12 +18,15 @@ import numpy as np
 import pytest
 
 import benchmarks
-from benchmarks import RESULTS, pictures, readme_table, results_page
+from benchmarks import RESULTS, pictures, readme_table, results_page, searches
 from benchmarks.speed import compare, scaling, timing
 from benchmarks.speed.workloads import SIZES, flop, products, workload
+from folders import a_run
 from pegasus_jax import tasks
+from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli.train import understood
 from pegasus_jax.runs import config_io, machine
+from probes import unchecked
 
 TINY = {
     "task": "cartpole",
@@ -113,6 +116,26 @@ def test_two_processors_of_one_name_are_told_apart(monkeypatch):
         known = {"flags": "sse", "model": "17", "cpu family": family, "model name": "AMD EPYC"}
         monkeypatch.setattr(machine, "cpu", lambda known=known: known)
         assert machine.about("")["processor"] == said
+
+
+def test_searches_under_a_runs_model_end_with_a_cost_for_each_policy(tmp_path, capsys):
+    run, out = str(a_run(tmp_path / "run", trials=2, search__refine_fraction="0.5")), tmp_path / "found.json"
+    unchecked(searches.main)([run, "trial=1", "policies=2", "search.steps=2", f"out={out}"])
+    first, second = json.loads(out.read_text())["imagined_cost"]
+    assert 0 < first < 1
+    assert 0 < second < 1
+    assert first != second
+    assert f"2 policies after trial 1, imagined cost: mean {(first + second) / 2:.3f}" in capsys.readouterr().out
+    plain = a_run(tmp_path / "plain", trials=1, search__refine_fraction="0", search__init="previous")
+    for words, said in [
+        ([], "the first word is missing"),
+        ([run, "policies=two"], "policies=two is not a whole number"),
+        ([run, "trial=3"], "no checkpoint of trial=3; choose from 1, 2"),
+        ([run, "search.stepps=2"], "did you mean 'search.steps'"),
+        ([str(plain)], "expected search.refine_fraction=0.5"),
+    ]:
+        with pytest.raises((ConfigError, RunError), match=re.escape(said)):
+            searches.main(words)
 
 
 @pytest.mark.slow
