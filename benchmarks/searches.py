@@ -1,11 +1,11 @@
 """What searches end with, each from a policy of its own that knows nothing, under the model of a run.
 
-    python -m benchmarks.searches RUN [trial=last] [policies=32] [out=FILE] [setting=value ...]
+    python -m benchmarks.searches RUN [trial=last] [policies=32] [out=FILE] [search.SETTING=value ...]
 
 RUN is the folder of any run, and `trial` the one after which its model is taken. The settings are the run's own, but
-for those given here. All policies are searched for in one program, so on a GPU many take as long as a few. Prints how
-much they are expected to cost a step on fresh scenarios, of which a run would have had one: a spread says that the
-search decides, where they agree the model does, or the plant.
+for those of the search that are given here. All policies are searched for in one program, so on a GPU many take as
+long as a few. Prints how much they are expected to cost a step on fresh scenarios, of which a run would have had one:
+a spread says that the search decides, where they agree the model does, or the plant.
 """
 
 import shlex
@@ -45,6 +45,9 @@ def main(given: list[str]) -> None:
         raise ConfigError("the first word is missing; expected the folder of a run")
     run, *words = given
     options, dotted = config_io.split(words, ("trial", "policies", "out"))
+    for name in dotted:
+        if not name.startswith("search."):
+            raise ConfigError(f"{name} is the run's own; expected settings of a search, as search.steps=500")
     trial, policies = options.get("trial", restore.LAST), whole("policies", options.get("policies", "32"))
     config, known, state = restore.ready(Path(run), int(trial) if trial.isdecimal() else trial)
     if not isinstance(config.search, Search) or not config.search.refine_fraction:
