@@ -130,6 +130,7 @@ def test_searches_under_a_runs_model_end_with_a_cost_for_each_policy(tmp_path, c
     for words, said in [
         ([], "the first word is missing"),
         ([run, "policies=two"], "policies=two is not a whole number"),
+        ([run, "policies=0"], "policies=0 is out of range"),
         ([run, "trial=3"], "no checkpoint of trial=3; choose from 1, 2"),
         ([run, "model.hidden=[9]"], "model.hidden is the run's own; expected settings of a search"),
         ([run, "search.stepps=2"], "did you mean 'search.steps'"),
