@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import struct
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -94,6 +95,28 @@ def test_what_happens_now_is_said(run: Path) -> None:
     store.write_trials(run, [row(trial) for trial in (1, 2, 3)])
     assert state([run]) == "done: 3 of 3 trials"
     assert state([run.parent / "gone"]).startswith(f"{run.parent / 'gone'} is not a run")
+
+
+def test_a_tab_that_closes_before_its_answer_leaves_no_traceback(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    asked, closed = threading.Event(), threading.Event()
+
+    def late(_: object) -> str:
+        asked.set()
+        assert closed.wait(20)
+        return "x" * 10_000_000
+
+    monkeypatch.setattr(serve, "state", late)
+    with served(run) as address:
+        host, port = address.removeprefix("http://").rstrip("/").split(":")
+        with socket.create_connection((host, int(port))) as tab:
+            tab.sendall(f"GET /state HTTP/1.0\r\nHost: {host}:{port}\r\n\r\n".encode())
+            assert asked.wait(20)
+            tab.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # closed at once
+        closed.set()
+        time.sleep(0.5)
+    assert "Traceback" not in capfd.readouterr().err
 
 
 def test_a_run_without_a_trial_is_waited_for(run: Path) -> None:
