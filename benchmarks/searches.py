@@ -18,6 +18,7 @@ import numpy as np
 
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import ConfigError, RunError, check_range, whole
+from pegasus_jax.cli.runs import trial_of
 from pegasus_jax.config import Search
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.runs import config_io, restore
@@ -50,7 +51,7 @@ def main(given: list[str]) -> None:
             raise ConfigError(f"{name} is the run's own; expected settings of a search, as search.steps=500")
     trial, policies = options.get("trial", restore.LAST), whole("policies", options.get("policies", "32"))
     check_range("policies", policies, 1)
-    config, known, state = restore.ready(Path(run), int(trial) if trial.isdecimal() else trial)
+    config, known, state = restore.ready(Path(run), trial_of(trial))
     if not isinstance(config.search, Search) or not config.search.refine_fraction:
         raise ConfigError(f"{run} has a search that begins with the policy before; expected search.refine_fraction=0.5")
     config = config_io.override(config, {"search.init": "fresh"} | dotted)
