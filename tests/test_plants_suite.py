@@ -27,15 +27,20 @@ def function(name: str, setting: str) -> Any:
     return jax.jit(user_code.load(setting, words[setting])) if setting in words else None
 
 
+# Controls that end an episode where random ones do not: force along the rate.
+ENDED_BY = {"MountainCarContinuous-v0": lambda x: np.sign(x[1:])}
+
+
 @pytest.mark.parametrize("name", [name for name in PLANTS if function(name, "stop") is not None])
 def test_episodes_end_where_their_user_says(name: str) -> None:
     stop, env = function(name, "stop"), gymnasium.make(PLANTS[name].env)
     env.action_space.seed(0)
     ends = 0
     for seed in range(20):
-        env.reset(seed=seed)
+        x, _ = env.reset(seed=seed)
         for _ in range(200):
-            x, _, terminated, truncated, _ = env.step(env.action_space.sample())
+            control = ENDED_BY[name](x) if name in ENDED_BY else env.action_space.sample()
+            x, _, terminated, truncated, _ = env.step(control)
             assert (stop(jnp.asarray(x)) > 0.5) == terminated, x
             if terminated or truncated:
                 ends += terminated
@@ -50,6 +55,7 @@ def test_episodes_end_where_their_user_says(name: str) -> None:
         ("InvertedPendulum-v5", [0, 0, 0, 0]),
         ("InvertedDoublePendulum-v5", [0, 0, 0, 1, 1, 0, 0, 0, 0]),
         ("CartPole", [0, 0, 0, np.pi]),
+        ("MountainCarContinuous-v0", [0.45, 0]),
         ("Quadrotor", [0, 0, 0, 0, 0, 0]),
         ("BallOnBeam", [0, 0, 0, 0]),
         ("FourTanks", [12, 14, 0, 0]),
@@ -211,6 +217,16 @@ def test_one_seed_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert len(row["returns"]) == 50
     assert row["plant_seconds"] == pytest.approx(2)
     assert "Pendulum-v1" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_a_plant_whose_rate_is_small_is_learned_in_three_episodes(tmp_path: Path) -> None:
+    """The car's is .01 m a step: a policy that cannot see it pushes forever, and the return stays below 0."""
+    main(
+        ["plants=[MountainCarContinuous-v0]", "seeds=[100]", "jobs=1", "episodes=10", "trials=3", f"out={tmp_path}/it"]
+    )
+    (run,) = json.loads((tmp_path / "it").read_text())["runs"]
+    assert max(row["native"] for row in run["trials"]) >= PLANTS["MountainCarContinuous-v0"].bar
 
 
 AWAY = {  # for each plant of joints: a goal, and what is far from it

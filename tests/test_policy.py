@@ -146,7 +146,7 @@ every_kind = pytest.mark.parametrize("kind", KINDS)
 
 
 @every_kind
-@given(seed=st.integers(0, 2**16), size=st.floats(1e-3, 9.0))
+@given(seed=st.integers(0, 2**16), size=st.floats(0.15, 9.0))
 def test_inputs_of_ordinary_size_are_left_as_they_are(kind, seed, size):
     """To the last bit: parameters, control and gradient."""
     policy = KINDS[kind]()
@@ -204,8 +204,43 @@ def test_a_large_entry_does_not_saturate_a_policy(kind, name):
     assert np.median(given) > 0.1
 
 
-@pytest.mark.parametrize("size", [30.0, 180.0, 1e6])
-def test_the_length_scale_of_a_large_entry_is_its_spread(size):
+@pytest.mark.parametrize("kind", ["mlp", "linear"])
+@pytest.mark.parametrize("size", [0.02, 1e-3, 1e-6])
+def test_a_small_entry_is_seen_whatever_its_unit(kind, size):
+    """A fresh policy answers to it as to the same entry in units that make it large, and not as if it were absent."""
+    entry, policy = 2 + np.random.default_rng(0).normal(size=30), KINDS[kind]()
+
+    def answers(entry):
+        data = with_entry(entry)
+        params = policy.adapt(policy.init(jax.random.key(0)), data)
+        return np.asarray(jax.vmap(lambda x: policy.apply(params, None, x))(data.x[:30]))
+
+    small = answers(size * entry)
+    np.testing.assert_allclose(small, answers(1e3 * entry), rtol=1e-3, atol=1e-4)
+    assert np.max(np.abs(small - answers(np.zeros(30)))) > 0.01
+
+
+@every_kind
+@pytest.mark.parametrize("constant", [0.0, 0.01])
+def test_a_small_entry_that_never_moved_is_not_blown_up(kind, constant):
+    policy = KINDS[kind]()
+    data, moved = with_entry(np.full(30, constant)), with_entry(np.full(30, constant + 0.1))
+    params = policy.adapt(policy.init(jax.random.key(0)), data)
+    controls = [np.asarray(jax.vmap(lambda x: policy.apply(params, None, x))(d.x[:30])) for d in (data, moved)]
+    assert np.isfinite(controls).all()
+    assert np.max(np.abs(controls[1] - controls[0])) < 0.5
+
+
+def test_the_sine_of_an_angle_that_moved_little_is_no_small_entry():
+    policy, data = controller(dropout.none(), waves=2), experience(30)
+    data = data._replace(x=data.x.at[:30].multiply(1e-3))
+    params = policy.adapt(policy.init(jax.random.key(0)), data)
+    assert np.array_equal(params["input"].scale[2:], [1, 1])
+    assert (np.asarray(params["input"].scale)[:2] < 0.05).all()
+
+
+@pytest.mark.parametrize("size", [30.0, 180.0, 1e6, 1e-3])
+def test_the_length_scale_of_a_large_or_small_entry_is_its_spread(size):
     """exp of 89 and more is not finite in float32."""
     policy, data = KINDS["rbf"](), with_entry(size * np.random.default_rng(0).normal(size=30))
     params = policy.adapt(policy.init(jax.random.key(0)), data)
@@ -229,9 +264,11 @@ def adapted(entry):
     return scaled(params["input"], encode(x, (2,))), jax.vmap(partial(policy.apply, params, None))(x)
 
 
-@pytest.mark.parametrize(("size", "expected"), [(0.01, 0.03), (0.5, 1.5), (1.0, 3.0), (2.0, 3.0), (15.0, 3.0)])
+@pytest.mark.parametrize(
+    ("size", "expected"), [(0.01, 3.0), (0.1, 0.3), (0.5, 1.5), (1.0, 3.0), (2.0, 3.0), (15.0, 3.0)]
+)
 def test_units_that_are_found_leave_no_input_larger_than_the_others(size, expected):
-    """decision 0040: root mean squares above 1 become 3, smaller ones three times as large; sines and cosines, too."""
+    """decision 0040: root mean squares above 1, or far below, become 3, others three times as large; so do waves."""
     entry = np.random.default_rng(0).normal(size=30)
     entry *= size / np.sqrt(np.mean(entry**2))
     inputs, _ = adapted(entry)

@@ -42,6 +42,16 @@ def double_pendulum_falls(x: Array) -> Array:
     return jax.nn.sigmoid((1 - _tip(x)[1]) / 0.02)
 
 
+def mountain_car(x: Array) -> Array:
+    """[place, rate]: the top of the hill."""
+    return saturating((x[0] - 0.45) / 0.3)
+
+
+def mountain_car_is_up(x: Array) -> Array:
+    """The episode ends there."""
+    return x[0] >= 0.45
+
+
 def reacher(x: Array, u: Array) -> Array:
     """[2 cosines, 2 sines, target, rates], links of .1 and .11 m: what a step loses, of the most that it can be."""
     along = 0.1 * x[0] + 0.11 * (x[0] * x[1] - x[2] * x[3])

@@ -28,6 +28,7 @@ from pegasus_jax.runs.files import write_whole
 USUAL = [
     "pendulum",
     "inverted_pendulum",
+    "mountain_car",
     "double_pendulum",
     "reacher",
     "dm_cartpole",

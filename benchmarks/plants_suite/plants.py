@@ -52,6 +52,10 @@ PLANTS: dict[str, Plant] = {
     "CartPole": Plant(
         "pegasus_envs:pegasus/CartPoleSwingUp-v0", task(25, "cartpole", angles="[3]", rates="[1,2]"), 15, -12.5, 20.0
     ),
+    # A weak motor in a valley, whose episodes end on the hill; its rate is .01 m a step.
+    "MountainCarContinuous-v0": Plant(
+        "MountainCarContinuous-v0", (*task(150, "mountain_car", "mountain_car_is_up"), "stop_cost=0"), 6, 90.0, 15.0
+    ),
     # The most is 250, for who has been above the line for all of the 10 s.
     "pendubot": Plant(f"{AIO}Pendubot-v0", task(50, "two_links", angles="[0,1]", rates="[2,3]"), 30, 125.0, 60.0),
     "acrobot": Plant(f"{AIO}Acrobot-v0", task(50, "two_links", angles="[0,1]", rates="[2,3]"), 45, 125.0, 90.0),

@@ -17,7 +17,8 @@ class MLP:
     dropout: float = setting(0.0, "drop probability of the hidden units; 0 is a deterministic policy")
     squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
     input_units: tuple[float, ...] | None = setting(
-        (), "unit of each state that is not an angle, one number each; []: the plant's units; null: found in the data"
+        (),
+        "unit of each state that is no angle; []: the plant's, but for huge and tiny numbers; null: found in the data",
     )
     initializer: str = setting("glorot", "initial weights: glorot, orthogonal")
 

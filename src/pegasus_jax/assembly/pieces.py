@@ -122,14 +122,13 @@ def policy_of(config: settings.MLP | settings.RBF | settings.Linear, task: Task)
         encode=partial(angles.encode, angles=turning),
         controls=len(task.control_names),
         saturate=to_limits(SQUASHES[config.squash], low, high),
+        waves=2 * len(turning),
     )
     # Of the saturations, only the sine has moments in closed form.
     saturate_moments = partial(gaussian.squash, low=low, high=high) if config.squash == "sine" else None
     match config:
         case settings.RBF():
-            centers: dict[str, Any] = dict(
-                start=partial(first_seen, task=task), waves=2 * len(turning), num_centers=config.num_centers
-            )
+            centers: dict[str, Any] = dict(start=partial(first_seen, task=task), num_centers=config.num_centers)
             return rbf(**shared, **centers, saturate_moments=saturate_moments)
         case settings.Linear():
             return linear(**shared, features=features, saturate_moments=saturate_moments)

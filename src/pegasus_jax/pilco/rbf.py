@@ -49,7 +49,7 @@ def rbf(
         return saturate(jnp.sum(kernel(encode(x), params["centres"], lengthscales) * beta, -1))
 
     def adapt(params: Params, data: Dataset) -> Params:
-        scale = of_data(encode(data.x), data.size).scale
+        scale = of_data(encode(data.x), data.size, waves=waves).scale
         before = scale + jnp.log(-jnp.expm1(-scale))  # a length scale of the data's own size, before softplus
         return params | {"lengthscales": jnp.where(scale == 1, params["lengthscales"], before)}
 

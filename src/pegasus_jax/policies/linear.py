@@ -18,12 +18,13 @@ def linear(
     controls: int,
     saturate: Callable[[Array], Array],
     saturate_moments: Map | None,
+    waves: int = 0,
     scale: float = 0.1,
 ) -> Policy:
     """u [U] = saturate(weights [U, F] @ encode(x [D]) + bias [U]) (Deisenroth 2010, sec. 3.5.2).
 
     Initial weights are normal with standard deviation `scale`. `saturate_moments` is the moment form of `saturate`, or
-    None where there is none: then the policy has no `moments`.
+    None where there is none: then the policy has no `moments`. The last `waves` features are sines and cosines.
     """
 
     def init(key: Key) -> Params:
@@ -34,7 +35,7 @@ def linear(
         return saturate(params["weights"] @ encode(x) + params["bias"])
 
     def adapt(params: Params, data: Dataset) -> Params:
-        mean, scale = of_data(encode(data.x), data.size)
+        mean, scale = of_data(encode(data.x), data.size, waves=waves)
         weights = params["weights"] / scale
         return {"weights": weights, "bias": params["bias"] - weights @ mean}
 

@@ -20,6 +20,7 @@ def mlp(
     dropout: Dropout,
     saturate: Callable[[Array], Array],
     initializer: str,
+    waves: int = 0,
     input_scale: Array | float = 1.0,
     units: Array | float = 1.0,
     find_units: bool = False,
@@ -27,10 +28,10 @@ def mlp(
 ) -> Policy:
     """u [U] = saturate(network(encode(x [D]) * input_scale)); noise on hidden layers' outputs (docs/reference.md 5.1).
 
-    A fresh network divides each input by its unit [F], and what the data have large is standardized; with
-    `find_units` the units of all are found in the data: see `scaled`. They are kept with the parameters. The
-    outgoing weights begin `output_scale` times as large as usual: a small one begins with controls near the middle of
-    their range.
+    A fresh network divides each input by its unit [F], and what the data have large or small is standardized, but for
+    the last `waves`, which are sines and cosines; with `find_units` the units of all are found in the data: see
+    `scaled`. They are kept with the parameters. The outgoing weights begin `output_scale` times as large as usual: a
+    small one begins with controls near the middle of their range.
     """
     network = MLP(hidden, controls, initializer)
 
@@ -44,7 +45,7 @@ def mlp(
         return {"network": net, "noise": noise, "input": in_units(jnp.ones(features) * units)}
 
     def adapt(params: Params, data: Dataset) -> Params:
-        return params | {"input": of_data(encode(data.x) * input_scale, data.size, units, find_units)}
+        return params | {"input": of_data(encode(data.x) * input_scale, data.size, units, find_units, waves)}
 
     def sample(key: Key) -> tuple[Array, ...]:
         keys = jax.random.split(key, len(hidden))

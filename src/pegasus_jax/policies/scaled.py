@@ -1,4 +1,4 @@
-"""A controller's inputs, in units in which they are of order one: large ones would saturate it."""
+"""A controller's inputs, in units in which they are of order one: large ones saturate it, small ones go unseen."""
 
 from typing import NamedTuple
 
@@ -7,7 +7,8 @@ import jax.numpy as jnp
 
 from pegasus_jax.types import Array
 
-LARGE = 20.0  # root mean square; entries of our own plants reach 9, and are left as they are
+LARGE = 20.0  # root mean square; entries of our own plants reach 15, and are left as they are
+SMALL = 1 / LARGE  # entries of our own plants are .1 and more: docs/decisions.md 0040
 MOST = 3.0  # root mean square of an entry whose unit is found in the data: docs/decisions.md 0040
 CONSTANT = 1e-5  # of its size: what an entry varies by rounding
 
@@ -24,11 +25,12 @@ def in_units(units: Array) -> Input:
     return Input(jnp.zeros_like(units), units)
 
 
-def of_data(features: Array, size: Array, units: Array | float = 1.0, found: bool = False) -> Input:
+def of_data(features: Array, size: Array, units: Array | float = 1.0, found: bool = False, waves: int = 0) -> Input:
     """The input for data whose first `size` rows of features [N, F] are in use, each counted in its unit [F].
 
-    A feature whose root mean square is more than LARGE has its mean subtracted and is divided by its standard
-    deviation, or by its unit where it is constant; the others are divided by their unit only. With units to be
+    A feature whose root mean square is more than LARGE or less than SMALL has its mean subtracted and is divided by its
+    standard deviation, or by its unit where it is constant; the others are divided by their unit only. The last `waves`
+    are sines and cosines, which are never too small: an angle may have moved little so far. With units to be
     `found` in the data, those whose root mean square is above 1 then have MOST, and smaller ones are MOST times as
     large as they were.
     """
@@ -39,10 +41,11 @@ def of_data(features: Array, size: Array, units: Array | float = 1.0, found: boo
     mean = jnp.sum(rows, 0) / count
     size_of = jnp.sqrt(jnp.sum(rows**2, 0) / count)
     spread = jnp.sqrt(jnp.sum(jnp.where(used, rows - mean, 0) ** 2, 0) / count)
-    large = size_of > LARGE
+    small = (size_of < SMALL) & (jnp.arange(len(size_of)) < len(size_of) - waves)
+    strange = (size_of > LARGE) | small
     others, most = (jnp.maximum(size_of, 1), MOST) if found else (1, 1)
-    scale = jnp.where(large, jnp.where(spread > CONSTANT * size_of, spread, 1), others) / most
-    return Input(jnp.where(large, mean, 0) * units, scale * units)
+    scale = jnp.where(strange, jnp.where(spread > CONSTANT * size_of, spread, 1), others) / most
+    return Input(jnp.where(strange, mean, 0) * units, scale * units)
 
 
 def scaled(given: Input, features: Array) -> Array:
