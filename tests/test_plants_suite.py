@@ -206,6 +206,12 @@ def test_a_plant_that_is_not_there_is_one_line() -> None:
         main(["plants=[Pendulum]"])
 
 
+def test_results_that_would_have_the_name_of_their_runs_folder_are_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"is a folder's name; expected that of a file: out=.*suite\.json"):
+        main(["plants=[Pendulum-v1]", f"out={tmp_path / 'suite'}"])
+    assert not [*tmp_path.iterdir()]
+
+
 @pytest.mark.campaign
 def test_one_seed_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["fit.steps=5", "search.steps=5", "model.hidden=[8]", "policy.hidden=[8]", "trials=1"]
@@ -222,10 +228,9 @@ def test_one_seed_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str
 @pytest.mark.slow
 def test_a_plant_whose_rate_is_small_is_learned_in_three_episodes(tmp_path: Path) -> None:
     """The car's is .01 m a step: a policy that cannot see it pushes forever, and the return stays below 0."""
-    main(
-        ["plants=[MountainCarContinuous-v0]", "seeds=[100]", "jobs=1", "episodes=10", "trials=3", f"out={tmp_path}/it"]
-    )
-    (run,) = json.loads((tmp_path / "it").read_text())["runs"]
+    out = tmp_path / "suite.json"
+    main(["plants=[MountainCarContinuous-v0]", "seeds=[100]", "jobs=1", "episodes=10", "trials=3", f"out={out}"])
+    (run,) = json.loads(out.read_text())["runs"]
     assert max(row["native"] for row in run["trials"]) >= PLANTS["MountainCarContinuous-v0"].bar
 
 

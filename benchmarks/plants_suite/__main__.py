@@ -23,7 +23,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from benchmarks import once
+from benchmarks import beside_runs, once
 from benchmarks.plants_suite.native import MOST
 from benchmarks.plants_suite.plants import PLANTS
 from pegasus_jax.checks import ConfigError, did_you_mean
@@ -112,12 +112,12 @@ def main(given: list[str]) -> None:
     seeds = seed_list(options.get("seeds", "100-109").strip("[]"))
     if wrong := [name for name in names if name not in PLANTS]:
         raise ConfigError(f"plants={wrong[0]} is unknown; {did_you_mean(wrong[0], PLANTS)}")
-    out = Path(options.get("out", "runs/plants_suite.json")).absolute()
+    out, home = beside_runs(options.get("out", "runs/plants_suite.json"))
     jobs, minutes = int(options.get("jobs", "2")), float(options.get("minutes", "60"))
     episodes = int(options.get("episodes", MOST))
     cores = core_queue(jobs)
     told = about(shlex.join(["python", "-m", "benchmarks.plants_suite", *given]))
-    (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
+    home.mkdir(parents=True, exist_ok=True)
     words, runs = [f"{key}={value}" for key, value in rest.items()], list[dict[str, Any]]()
     with ThreadPoolExecutor(jobs) as pool:
         same = (home, words, minutes, episodes, cores)

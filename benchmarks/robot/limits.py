@@ -20,7 +20,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import once
+from benchmarks import beside_runs, once
 from benchmarks.plants_suite.__main__ import ONE_CORE, core_queue, on_core
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import PROGRAM
@@ -137,10 +137,10 @@ def main(given: list[str]) -> None:
         raise ConfigError("furuta= is missing: the folder of robot.py; for example furuta=shared/furuta")
     ONE_CORE["PYTHONPATH"] = os.pathsep.join([options["furuta"], ONE_CORE["PYTHONPATH"]])
     seeds, jobs = seed_list(options.get("seeds", "100-109")), int(options.get("jobs", "2"))
-    out, minutes = Path(options.get("out", "runs/limits.json")).absolute(), float(options.get("minutes", "9"))
+    (out, home), minutes = beside_runs(options.get("out", "runs/limits.json")), float(options.get("minutes", "9"))
     cores = core_queue(jobs)
     told = about(shlex.join(["python", "-m", "benchmarks.robot.limits", *given]))
-    (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
+    home.mkdir(parents=True, exist_ok=True)
     words, runs = [f"{key}={value}" for key, value in rest.items()], list[dict[str, Any]]()
     with ThreadPoolExecutor(jobs) as pool:
         for job in as_completed([pool.submit(one, seed, home, words, minutes, cores) for seed in seeds]):

@@ -11,7 +11,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any
 
-from benchmarks import once
+from benchmarks import beside_runs, once
 from benchmarks.plants_suite.__main__ import ONE_CORE, core_queue, on_core
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import PROGRAM
@@ -38,9 +38,9 @@ def robot(options: dict[str, str]) -> Path:
 def learned(options: dict[str, str], words: Sequence[str], command: str) -> list[dict[str, Any]]:
     """The runs of all seeds with what is kept of their trials, written to `out` after each of them."""
     until = time.monotonic() + 60 * float(options.get("minutes", "9"))
-    out, told = Path(options["out"]).absolute(), about(command)
+    (out, home), told = beside_runs(options["out"]), about(command)
     cores = core_queue(jobs := int(options.get("jobs", "2")))
-    (home := out.with_suffix("")).mkdir(parents=True, exist_ok=True)
+    home.mkdir(parents=True, exist_ok=True)
     runs: list[dict[str, Any]] = []
     words = once(*words, f"trials={options['trials']}")
     with ThreadPoolExecutor(jobs) as pool:
