@@ -13,7 +13,7 @@ def once(*words: object) -> list[str]:
 
 
 def beside_runs(out: str) -> tuple[Path, Path]:
-    """(file of the results, folder of the runs that they are of). Raises ConfigError where both have one name."""
+    """(file of the results, folder of the runs that they are of). Raises ConfigError unless `out` ends in .json."""
     path = Path(out).absolute()
     if path.suffix != ".json":
         raise ConfigError(f"out={out} is a folder's name; expected that of a file: out={out}.json")

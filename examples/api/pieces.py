@@ -147,12 +147,12 @@ assert policy.apply(theta, policy.sample(key), jnp.zeros(D)).shape == (U,)  # wi
 # mlp
 encode, saturate = partial(pg.angles.encode, angles=(3,)), lambda v: 10 * jnp.tanh(v)
 network = pg.mlp(
-    encode=encode, features=D + 1, controls=U, hidden=(16,), dropout=pg.dropouts.none(), saturate=saturate,
+    encode=encode, features=D + 1, waves=2, controls=U, hidden=(16,), dropout=pg.dropouts.none(), saturate=saturate,
     initializer="glorot",
 )  # fmt: skip
 
 # linear
-gains = pg.linear(encode=encode, features=D + 1, controls=U, saturate=saturate, saturate_moments=None)
+gains = pg.linear(encode=encode, features=D + 1, waves=2, controls=U, saturate=saturate, saturate_moments=None)
 
 # rbf
 bumps = pg.rbf(
