@@ -5,10 +5,10 @@
 Words and file as in benchmarks.study; `search.cost_estimator=particles` follows the cost of each particle.
 """
 
-import sys
+from functools import partial
 from typing import Any
 
-from benchmarks import study
+from benchmarks import command, study
 from pegasus_jax import tasks
 from pegasus_jax.types import Cost
 
@@ -23,4 +23,4 @@ def of_plant(name: str, plant: Any) -> Any:
 
 if __name__ == "__main__":
     tasks.of_plant = of_plant
-    study.main(sys.argv[1:], "benchmarks.own_cost")
+    command(partial(study.main, module="benchmarks.own_cost"), __doc__)

@@ -9,7 +9,6 @@ swingup.png too, the episode frame by frame. What makes these runs is in RUNS; w
 the command is said. The curves of benchmarks/results are drawn by benchmarks.results_page.
 """
 
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +24,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
+from benchmarks import command
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.plant import Plant
@@ -146,4 +146,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

@@ -6,9 +6,10 @@ Run it after a study was added: it draws the figures' pictures and writes what i
 """
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks import RESULTS, readme_table
+from benchmarks import RESULTS, command, readme_table
 from benchmarks.paper import claims
 from benchmarks.paper.comparison import draw, results
 from benchmarks.paper.figures import Figure, read
@@ -20,7 +21,7 @@ ORDER = ("cartpole", "crn", "clip", "rbf", "nn", "double")
 BEGIN, END = "<!-- generated: python -m benchmarks.results_page -->\n", "<!-- generated until here -->\n"
 
 
-def main() -> None:
+def main(_: Sequence[str] = ()) -> None:
     """Draw every figure that has studies, and write the generated part of both pages."""
     for path in FIGURES.glob("*.toml"):
         figure = read(path)
@@ -77,4 +78,4 @@ def shown(folder: Path, out: Path) -> set[str]:
 
 
 if __name__ == "__main__":
-    main()
+    command(main, __doc__)

@@ -9,15 +9,15 @@ a spread says that the search decides, where they agree the model does, or the p
 """
 
 import shlex
-import sys
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import command, named
 from pegasus_jax.assembly.experiments import compose
-from pegasus_jax.checks import ConfigError, RunError, check_range, whole
+from pegasus_jax.checks import ConfigError, check_range, whole
 from pegasus_jax.cli.runs import trial_of
 from pegasus_jax.config import Search
 from pegasus_jax.experiment import Experiment
@@ -42,9 +42,7 @@ def ended(experiment: Experiment, state: RunState, keys: Key) -> np.ndarray:
 
 def main(given: list[str]) -> None:
     """The command line of this module. Raises ConfigError or RunError for what it cannot use."""
-    if not given or "=" in given[0]:
-        raise ConfigError("the first word is missing; expected the folder of a run")
-    run, *words = given
+    run, words = named(given, "the folder of a run")
     options, dotted = config_io.split(words, ("trial", "policies", "out"))
     for name in dotted:
         if not name.startswith("search."):
@@ -73,7 +71,4 @@ def spread(costs: np.ndarray) -> str:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except (ConfigError, RunError) as error:
-        sys.exit(f"searches: {error}")
+    command(main, __doc__)

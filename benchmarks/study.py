@@ -6,9 +6,8 @@ Writes benchmarks/results/NAME.json: per seed and trial the mean cost of 20 eval
 """
 
 import shlex
-import sys
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command, named
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import share_cpus
@@ -17,7 +16,7 @@ from pegasus_jax.runs.study import seed_list, study, table, write
 
 def main(words: list[str], module: str = "benchmarks.study") -> None:
     """The command line of this module, or of another that changes what it runs."""
-    name, *rest = words
+    name, rest = named(words, "the name of the file that this writes, without .json")
     options, dotted = config_io.split(rest, ("seeds",))
     config = config_io.parse(dotted)
     path = RESULTS / f"{name}.json"
@@ -32,4 +31,4 @@ def main(words: list[str], module: str = "benchmarks.study") -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

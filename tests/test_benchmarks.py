@@ -4,11 +4,13 @@ And the stored results: a page shows each of them, and README's table says what 
 """
 
 import dataclasses
+import importlib.util
 import json
 import os
 import re
 import runpy
 import shlex
+import sys
 from pathlib import Path
 
 import imageio.v2 as imageio
@@ -18,7 +20,9 @@ import numpy as np
 import pytest
 
 import benchmarks
-from benchmarks import RESULTS, pictures, readme_table, results_page, searches
+from benchmarks import RESULTS, pictures, readme_table, results_page, searches, study
+from benchmarks.plants_suite import batched
+from benchmarks.robot import costs
 from benchmarks.speed import compare, scaling, timing
 from benchmarks.speed.workloads import SIZES, flop, products, workload
 from folders import a_run
@@ -221,6 +225,35 @@ def test_a_peer_that_does_other_work_is_refused(found):
     assert agreed("peer", {"gradient": 1e-4}) == {"peer_gradient_difference": 1e-4}
     with pytest.raises(RuntimeError, match=f"peer: the {list(found)[-1]} differs"):
         agreed("peer", found)
+
+
+COMMANDS = sorted(
+    ".".join(file.relative_to(Path(benchmarks.__path__[0]).parent).with_suffix("").parts).removesuffix(".__main__")
+    for file in Path(benchmarks.__path__[0]).rglob("*.py")
+    if "    command(" in file.read_text()
+)
+
+
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules")
+@pytest.mark.parametrize("module", COMMANDS)
+def test_a_benchmark_that_is_asked_what_it_does_says_so_and_does_nothing(module, monkeypatch, capsys):
+    """The first words of a stranger: `python -m benchmarks.study --help` once learned a study of that name."""
+    if module == "benchmarks.peers.compare":
+        pytest.importorskip("torch")
+    file = (importlib.util.find_spec(module) or pytest.fail(module)).origin
+    monkeypatch.setattr(sys, "argv", [str(file), "--help"])
+    stored = {path: path.stat().st_mtime_ns for path in RESULTS.iterdir()}
+    runpy.run_module(module, run_name="__main__", alter_sys=False)
+    assert f"python -m {module}" in capsys.readouterr().out
+    assert {path: path.stat().st_mtime_ns for path in RESULTS.iterdir()} == stored
+
+
+@pytest.mark.parametrize(
+    ("main", "words"), [(study.main, []), (study.main, ["seeds=0-3"]), (costs.main, []), (batched.main, ["reacher"])]
+)
+def test_a_benchmark_without_its_first_word_says_what_that_is(main, words):
+    with pytest.raises(ConfigError, match="the first word is missing; expected "):
+        main(words)
 
 
 # Stored results

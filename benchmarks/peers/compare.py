@@ -13,7 +13,6 @@ a clone of github.com/merlresearch/MC-PILCO: see `of_mc_pilco`. The sizes must h
 
 import json
 import shlex
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -25,7 +24,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from benchmarks.peers import of_mc_pilco, of_prob_mbrl, plain_torch
 from benchmarks.speed.timing import compiled, in_turn, own_products, summary
 from benchmarks.speed.workloads import SIZES, Workload, goal, workload
@@ -161,4 +160,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

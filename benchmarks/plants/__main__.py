@@ -9,7 +9,6 @@ Accuracy: 20 s under random controls, 8 seeds. Energy: 10 s without friction and
 
 import json
 import shlex
-import sys
 import time
 from collections.abc import Callable
 from typing import Any
@@ -20,7 +19,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from benchmarks.plants.in_c import Drive, held, in_c, stroke
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
@@ -177,4 +176,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

@@ -6,12 +6,11 @@ Prints the best mean |e|^2 of each generation and the gains found. 32 candidates
 changes get 30 generations, the others 9.
 """
 
-import sys
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import command
 from benchmarks.plants.feedback import NAMES, ROLL, episodes
 from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax.runs import config_io
@@ -57,4 +56,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

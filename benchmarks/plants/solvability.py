@@ -8,14 +8,13 @@ swimmer's design (C MuJoCo, another hand-written law, its gains by CMA-ES, 16 st
 
 import json
 import shlex
-import sys
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from benchmarks.plants.feedback import GAINS, ROLL, episodes
 from pegasus_envs.swimmer.plant import swimmer
 from pegasus_jax.runs import config_io
@@ -91,4 +90,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

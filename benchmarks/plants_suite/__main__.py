@@ -23,7 +23,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from benchmarks import beside_runs, once
+from benchmarks import beside_runs, command, once
 from benchmarks.plants_suite.native import MOST
 from benchmarks.plants_suite.plants import PLANTS
 from pegasus_jax.checks import ConfigError, did_you_mean
@@ -129,7 +129,4 @@ def main(given: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except ConfigError as error:
-        sys.exit(f"plants_suite: {error}")
+    command(main, __doc__)

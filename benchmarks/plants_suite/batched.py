@@ -6,15 +6,14 @@ Writes and prints what benchmarks.study does. States are the joints' positions a
 models and searches do, and nothing of what a state is; the suite itself (__main__.py) judges by native returns.
 """
 
-import sys
 from functools import partial
 from pathlib import Path
 
 import gymnasium
 
-from benchmarks import study
+from benchmarks import command, named, study
 from benchmarks.plants_suite.plants import task
-from pegasus_jax.checks import did_you_mean
+from pegasus_jax.checks import ConfigError, did_you_mean
 
 ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
 of_joints = partial(task, module="costs_of_joints")
@@ -51,11 +50,12 @@ PLANTS: dict[str, tuple[str, ...]] = {
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    plant, *rest = words
+    plant, rest = named(words, f"one of {', '.join(PLANTS)}")
     if plant not in PLANTS:
-        sys.exit(f"{plant} is unknown; {did_you_mean(plant, PLANTS)}")
-    study.main([rest[0], "task=mjcf", *PLANTS[plant], *rest[1:]], f"benchmarks.plants_suite.batched {plant}")
+        raise ConfigError(f"{plant} is unknown; {did_you_mean(plant, PLANTS)}")
+    name, rest = named(rest, "the name of the file that this writes, without .json")
+    study.main([name, "task=mjcf", *PLANTS[plant], *rest], f"benchmarks.plants_suite.batched {plant}")
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

@@ -6,7 +6,6 @@ FILE is what `python -m benchmarks.plants_suite` wrote; without one, the stored 
 """
 
 import json
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,7 +17,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from benchmarks.plants_suite.__main__ import share
 from benchmarks.plants_suite.plants import PLANTS
 from pegasus_jax.checks import ConfigError
@@ -93,7 +92,4 @@ def main(words: Sequence[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except ConfigError as error:
-        sys.exit(f"plants_suite.picture: {error}")
+    command(main, __doc__)

@@ -9,7 +9,6 @@ Tuning seeds are 100 to 119; 200 and above are for a final judgment only.
 
 import json
 import shlex
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -21,9 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import command, named
 from benchmarks.robot import asked
 from pegasus_jax import sharding
-from pegasus_jax.checks import did_you_mean
+from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.files import write_json
@@ -143,12 +143,12 @@ def table(result: dict[str, Any]) -> str:
 
 def main(words: list[str]) -> None:
     """The command line of this module; `show FILE.json ...` prints the tables again."""
-    name, *rest = words
+    name, rest = named(words, f"one of {', '.join(TASKS)}")
     if name == "show":
         print("\n".join(table(json.loads(Path(file).read_text())) for file in rest))
         return
     if name not in TASKS:
-        sys.exit(f"{name} is unknown; {did_you_mean(name, TASKS)}")
+        raise ConfigError(f"{name} is unknown; {did_you_mean(name, TASKS)}")
     options, settings = config_io.split(rest, ("seeds", "out"))
     _, own = config_io.split(TASKS[name])
     seeds = seed_list(options.get("seeds", "100-109"))
@@ -159,4 +159,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

@@ -7,18 +7,17 @@ to fit. Each search is one of a run in which no episode has succeeded yet. Print
 step of 100 episodes and the share that succeeded. Tuning seeds are 100 to 119.
 """
 
-import sys
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import command
 from benchmarks.robot.cartpole_by_hand import exact
 from benchmarks.robot.sensors import CARTPOLE
 from pegasus_jax import episode, tasks
 from pegasus_jax.assembly.experiments import compose
-from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.study import seed_list
@@ -72,7 +71,4 @@ def main(given: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except ConfigError as error:
-        sys.exit(f"known_model: {error}")
+    command(main, __doc__)

@@ -20,7 +20,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import beside_runs, once
+from benchmarks import beside_runs, command, once
 from benchmarks.plants_suite.__main__ import ONE_CORE, core_queue, on_core
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import PROGRAM
@@ -150,7 +150,4 @@ def main(given: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except ConfigError as error:
-        sys.exit(f"limits: {error}")
+    command(main, __doc__)

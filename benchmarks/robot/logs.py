@@ -10,10 +10,9 @@ the same command goes on with runs that were stopped after `minutes`. Tuning see
 """
 
 import shlex
-import sys
 
+from benchmarks import command
 from benchmarks.robot import seeds
-from pegasus_jax.checks import ConfigError
 from pegasus_jax.runs import config_io
 
 TASK = (
@@ -33,7 +32,4 @@ def main(given: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except ConfigError as error:
-        sys.exit(f"logs: {error}")
+    command(main, __doc__)

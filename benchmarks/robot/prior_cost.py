@@ -7,6 +7,7 @@ A link on a hinge with 10 MuJoCo steps a control period, as an MJCF file and as 
 
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from benchmarks import command
 from pegasus_jax import preset, tasks
 from pegasus_jax.assembly.pieces import dynamics_of
 from pegasus_jax.models.residual import residual
@@ -68,7 +70,7 @@ def seconds(prior: Any, file: Path) -> tuple[float, float]:
     return compiled, (time.monotonic() - began) / 3
 
 
-def main() -> None:
+def main(_: Sequence[str] = ()) -> None:
     """Print the table."""
     with tempfile.TemporaryDirectory() as folder:
         files = {name: Path(folder) / f"{name}.xml" for name in ("free", "limited")}
@@ -83,4 +85,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    command(main, __doc__)

@@ -14,10 +14,10 @@ Tuning seeds are 100 to 119.
 """
 
 import shlex
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from benchmarks import command
 from benchmarks.robot import seeds
 from pegasus_jax.checks import ConfigError, choice
 from pegasus_jax.runs import config_io
@@ -86,7 +86,4 @@ def main(given: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except ConfigError as error:
-        sys.exit(f"sensors: {error}")
+    command(main, __doc__)

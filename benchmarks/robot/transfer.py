@@ -13,7 +13,6 @@ that are whole in the file. WAY.setting=value is of one way only.
 
 import json
 import shlex
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks import command
 from benchmarks.robot import cartpole_by_hand
 from pegasus_jax import sharding
 from pegasus_jax.checks import ConfigError
@@ -149,7 +149,4 @@ def main(given: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except ConfigError as error:
-        sys.exit(f"transfer: {error}")
+    command(main, __doc__)

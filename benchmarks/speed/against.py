@@ -215,6 +215,8 @@ def table(rows: dict[str, Row]) -> str:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
+    if not words or {"--help", "-h"} & set(words):
+        sys.exit(__doc__)
     folders = [Path(word).resolve() for word in words if "=" not in word]
     if len(folders) != 2:
         sys.exit(f"name two checkouts, OLD and NEW, not {len(folders)}")
@@ -240,4 +242,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    serve(sys.argv[2]) if sys.argv[1] == "serve" else main(sys.argv[1:])
+    serve(sys.argv[2]) if sys.argv[1:2] == ["serve"] else main(sys.argv[1:])

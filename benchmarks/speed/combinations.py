@@ -9,13 +9,12 @@ benchmarks/results/combinations.json.
 
 import json
 import shlex
-import sys
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from benchmarks.speed.growth import experience
 from benchmarks.speed.timing import compiled, in_turn, matmul
 from benchmarks.speed.workloads import ALIKE
@@ -60,4 +59,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

@@ -7,11 +7,10 @@ be held against a full one. Both must have been made with as many CPUs.
 """
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 
 STORED = RESULTS / "speed.json"
 LIMIT = 1.3
@@ -41,4 +40,4 @@ def main(words: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    command(main, __doc__)

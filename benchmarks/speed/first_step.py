@@ -17,6 +17,8 @@ import tempfile
 import time
 from typing import Any
 
+from benchmarks import command
+
 STARTED = "PEGASUS_STARTED"  # when the command was given [s since 1970]
 
 
@@ -80,4 +82,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

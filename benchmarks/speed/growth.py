@@ -12,14 +12,13 @@ that others use, pin it to one CPU (`taskset -c 0`): it then counts its own seco
 
 import json
 import shlex
-import sys
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from benchmarks.speed.timing import compiled, in_turn, matmul, summary
 from benchmarks.speed.workloads import ALIKE
 from pegasus_jax.assembly.experiments import build, set_precision
@@ -97,4 +96,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

@@ -12,7 +12,6 @@ import json
 import runpy
 import shlex
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -26,7 +25,7 @@ import numpy as np
 import onnxruntime
 from jax import export as jax_export
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from pegasus_jax import controller, export, tasks
 from pegasus_jax.exports.as_c import compiler
 from pegasus_jax.runs import config_io
@@ -144,4 +143,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

@@ -12,7 +12,6 @@ import json
 import os
 import shlex
 import subprocess
-import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +19,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from pegasus_jax.cli.sweep import PROGRAM
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
@@ -79,4 +78,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

@@ -15,7 +15,6 @@ import json
 import re
 import shlex
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from functools import partial
@@ -27,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from benchmarks.speed.timing import summary
 from benchmarks.speed.workloads import ALIKE, workload
 from pegasus_jax import sharding
@@ -175,4 +174,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

@@ -10,7 +10,6 @@ alone in the same process with the same shapes. On a process pinned to one CPU (
 import json
 import resource
 import shlex
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from benchmarks.speed.timing import clock, compiled, in_turn, matmul, own_products, summary
 from benchmarks.speed.workloads import SIZES, Workload, flop, workload
 from pegasus_jax.assembly.experiments import build
@@ -177,4 +176,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1:])
+    command(main, __doc__)

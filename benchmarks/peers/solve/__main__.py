@@ -24,7 +24,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks import RESULTS
+from benchmarks import RESULTS, command
 from benchmarks.peers.solve.attempt import PLANTS, PROGRAMS
 from benchmarks.peers.solve.shown import picture, table
 from benchmarks.plants_suite.__main__ import on_core
@@ -125,7 +125,4 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(sys.argv[1:])
-    except ConfigError as error:
-        sys.exit(f"peers.solve: {error}")
+    command(main, __doc__)
