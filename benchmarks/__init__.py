@@ -19,9 +19,11 @@ def command(main: Callable[[list[str]], int | None], what: str | None) -> None:
         print(what)
         return
     try:
-        sys.exit(main(words))
+        status = main(words)
     except (ConfigError, RunError) as error:
         sys.exit(f"{_name(Path(sys.argv[0]))}: {error}")
+    if status:
+        sys.exit(status)
 
 
 def _name(file: Path) -> str:

@@ -15,6 +15,7 @@ from benchmarks import own_cost, study
 from benchmarks.paper import claims
 from benchmarks.paper.comparison import Result
 from benchmarks.paper.comparison import stored as read
+from pegasus_jax.config import MANEUVERS
 from pegasus_jax.presets import PRESETS
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.study import SOLVED
@@ -36,31 +37,25 @@ class Row(NamedTuple):
 
 ROWS = (
     Row("cart-pole", "cartpole", ("cartpole-50",)),
-    Row("cart-pole, the paper's network", "cartpole_network", ("cartpole_network-50",)),
     Row(
         "cart-pole as your own plant: any cost, network",
         "cartpole_network",
         ("cartpole-own_cost-50",),
         own_cost,
     ),
-    Row("the same with a mechanism", "cartpole", ("cartpole-own_cost-mechanism",), own_cost),
     Row("double cart-pole, eight policies, on a GPU", "double_cartpole_gpu", ("double_cartpole-reheated",)),
     Row("double cart-pole, one policy", "double_cartpole", ("double_cartpole-default",)),
-    Row(
-        "swimmer, knife edge",
-        "swimmer_knife_edge",
-        ("swimmer_knife_edge-rounds",),
-    ),
-    Row("swimmer, belly up", "swimmer_belly_up", ("swimmer-belly_up",)),
-    Row("swimmer, corkscrew", "swimmer_corkscrew", ("swimmer-corkscrew",)),
-    Row("swimmer, depth change", "swimmer_depth_change", ("swimmer-depth_change",)),
-    Row(
-        "swimmer, knife edge, six legs",
-        "swimmer_knife_edge_six_legs",
-        ("swimmer_knife_edge-six_legs", "swimmer_knife_edge-six_legs-10"),
+    *(
+        Row(f"swimmer, {name.replace('_', ' ')}{legs}", f"swimmer_{name}{preset}", (f"{files}-{name}",))
+        for legs, preset, files in (("", "", "swimmer"), (", six legs", "_six_legs", "six_legs"))
+        for name in MANEUVERS
     ),
 )
-MORE = (Row("cart-pole, four policies, on a GPU", "cartpole", ("cartpole-four_policies",)),)
+MORE = (
+    Row("cart-pole, the paper's network", "cartpole_network", ("cartpole_network-50",)),
+    Row("cart-pole as your own plant: any cost, a mechanism", "cartpole", ("cartpole-own_cost-mechanism",), own_cost),
+    Row("cart-pole, four policies, on a GPU", "cartpole", ("cartpole-four_policies",)),
+)
 
 
 class Peer(NamedTuple):

@@ -7,9 +7,10 @@ import pytest
 
 from pegasus_jax.assembly.pieces import dynamics_of, policy_of
 from pegasus_jax.assembly.searchers import blocks_of
-from pegasus_jax.config import BNN, MLP
+from pegasus_jax.config import BNN, GP, MLP, Lagrangian, model_word, sized
 from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.models.ensemble import ensemble
+from pegasus_jax.tasks import assumed
 from pegasus_jax.types import Batch, Dataset, Period, Prediction
 from pegasus_jax.vectorized import for_particles
 from probes import cart
@@ -130,3 +131,34 @@ def test_members_see_different_rows(pair):
     equal = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf[:1], leaf.shape), params)
     gradient = jax.jit(jax.grad(many.loss))(equal, jax.random.key(3), Batch(*data[:3]), many.prepare(data))
     assert any(not np.allclose(leaf[0], leaf[1]) for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.mark.parametrize("states", [1, 4, 6, 7, 13, 40])
+def test_a_plant_of_more_than_six_states_has_five_networks_and_their_whole_divergence(states):
+    """What is said stays, and null becomes a number of the plant's size alone: docs/decisions.md 0017."""
+    chosen = sized(BNN(ensemble_size=None, kl_weight=None), states)
+    assert (chosen.ensemble_size, chosen.kl_weight) == ((5, 1.0) if states > 6 else (1, 0.1))
+    assert sized(BNN(ensemble_size=2, kl_weight=None), states).kl_weight == 1.0
+    assert sized(BNN(ensemble_size=None, kl_weight=0.3), states).kl_weight == 0.3
+    for said in (BNN(), BNN(ensemble_size=7, kl_weight=0.0), Lagrangian(ensemble_size=5)):
+        assert sized(said, states) == said
+
+
+@pytest.mark.parametrize(("states", "size"), [(6, 1), (7, 5)])
+def test_the_model_of_a_task_has_as_many_networks_as_its_states_ask_for(states, size):
+    task = cart()._replace(state_names=tuple(f"x{i}" for i in range(states)))
+    by_states, said = (
+        jax.eval_shape(dynamics_of(config, task).init, jax.random.key(0))
+        for config in (BNN(hidden=(8,), ensemble_size=None), BNN(hidden=(8,), ensemble_size=size))
+    )
+    assert jax.tree.map(jnp.shape, by_states) == jax.tree.map(jnp.shape, said)
+
+
+def test_a_run_says_that_its_states_ask_for_five_networks():
+    """Who chose a number is not told it again."""
+    default = BNN(ensemble_size=None, kl_weight=None)
+    (told,) = assumed.networks(default, 7)
+    assert told.startswith("7 states: the model is 5 networks")
+    assert [model_word(sized(default, states)) for states in (6, 7)] == ["log_normal", "log_normal of 5"]
+    quiet = ((default, 6), (BNN(), 7), (BNN(ensemble_size=5), 7), (Lagrangian(ensemble_size=5), 7), (GP(), 7))
+    assert [assumed.networks(model, states) for model, states in quiet] == [[]] * 5

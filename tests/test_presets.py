@@ -60,8 +60,9 @@ def test_any_task_can_begin_with_the_default(task):
         assert parse(f"preset=default task={task} legs=6") == dataclasses.replace(begun, legs=6)
 
 
-def test_a_plant_of_your_own_begins_with_the_default():
-    assert {dataclasses.replace(preset(task), task="") for task in (GYM, MJCF)} == {
+def test_plants_of_your_own_and_swimmers_begin_with_the_default():
+    swimmers = [own(task, legs) for task in TASKS if task.startswith("swimmer_") for legs in (2, 6)]
+    assert {dataclasses.replace(preset(name), task="", legs=2, trials=15) for name in (GYM, MJCF, *swimmers)} == {
         dataclasses.replace(DEFAULT, task="")
     }
 

@@ -166,7 +166,8 @@ def test_what_will_be_done_and_how_to_go_on(tmp_path: Path) -> None:
     assert "3 of 4 trials are done, 2 seeds" in announcement(config, Path("runs/a"), 2, 3)
     for word in ("log_normal", "deterministic", "ensemble", "lagrangian"):
         assert f"model {word}, policy" in announcement(parse({"model": word}), Path("a"))
-    assert "model log_normal of 5," in announcement(parse({"task": "swimmer_knife_edge"}), Path("a"))
+    five = {"task": "swimmer_knife_edge", "model.ensemble_size": "5"}
+    assert "model log_normal of 5," in announcement(parse(five), Path("a"))
     assert "begins again" in stopped(tmp_path)
     run = tmp_path / "my run"
     run.mkdir()

@@ -12,12 +12,12 @@ from typing import Any
 
 from pegasus_jax import checks
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.config_models import BNN, GP, SSGP, Lagrangian, setting
+from pegasus_jax.config_models import BNN, GP, SSGP, Lagrangian, Model, setting, several, sized
 from pegasus_jax.config_plant import EVERY, Explore, Sensors
 from pegasus_jax.config_policies import MLP, RBF, Linear
 
 __all__ = ["BNN", "GP", "LBFGS", "MLP", "RBF", "SSGP", "Analytic", "Config", "Explore", "Fit", "Lagrangian", "Linear"]
-__all__ += ["Period", "Search", "Sensors"]
+__all__ += ["Model", "Period", "Search", "Sensors", "several", "sized"]
 
 MANEUVERS = ("knife_edge", "belly_up", "corkscrew", "depth_change")
 GYM = "gym"  # the task that `env=` and `cost=` describe
@@ -207,9 +207,6 @@ class Analytic:
         checks.choice("search.init", self.init, INITS[:2])
 
 
-Model = BNN | GP | SSGP | Lagrangian
-
-
 @dataclass(frozen=True)
 class Config:
     """One run."""
@@ -385,8 +382,9 @@ def model_word(model: Model) -> str:
     """What `model=` calls these settings: a network is named by the noise on its units, or as an ensemble."""
     if not isinstance(model, BNN):
         return model.kind
-    plain = {"none": "ensemble" if model.ensemble_size > 1 else "deterministic"}.get(model.dropout)
-    return plain or model.dropout + (f" of {model.ensemble_size}" if model.ensemble_size > 1 else "")
+    size = several(model)  # 1 for null, until the plant's states are known: `sized`
+    plain = {"none": "ensemble" if size > 1 else "deterministic"}.get(model.dropout)
+    return plain or model.dropout + (f" of {size}" if size > 1 else "")
 
 
 def uses(task: str, name: str) -> bool:

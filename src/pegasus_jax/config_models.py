@@ -1,7 +1,7 @@
 """The settings of the models, and how a setting is declared; see config.py, which has them all."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from pegasus_jax import checks
@@ -23,11 +23,15 @@ class _Network:
     """What every network model has, and an ensemble of them."""
 
     kind: str = setting("", "")
-    ensemble_size: int = setting(1, "models fitted side by side; each particle follows one of them")
+    ensemble_size: int | None = setting(
+        1, "models fitted side by side, each particle follows one; null: five for more than six states, else one"
+    )
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
     log_z_min: float = setting(-10.0, "lower end of the interval of log z (log_normal), whose upper end is 0")
-    kl_weight: float = setting(0.1, "factor of the noise's KL divergence; 1 is the variational bound")
+    kl_weight: float | None = setting(
+        0.1, "factor of the noise's KL divergence; 1 is the variational bound; null: 1 for several models, .1 for one"
+    )
     weight_decay: float = setting(1.0, "factor of the Gaussian prior on the weights")
     activation: str = setting("silu", "nonlinearity: relu, silu, tanh")
     initializer: str = setting("glorot", "initial weights: glorot, orthogonal")
@@ -35,12 +39,14 @@ class _Network:
     def __post_init__(self) -> None:
         checks.typed("model", self)
         checks.kind("model", self.kind, type(self).kind)
-        checks.size("model.ensemble_size", self.ensemble_size)
+        if self.ensemble_size is not None:
+            checks.size("model.ensemble_size", self.ensemble_size)
         checks.layers("model.hidden", self.hidden)
         kinds = dict(activation=ACTIVATIONS, dropout=DROPOUTS, initializer=INITIALIZERS)
         for name, choices in kinds.items():
             checks.choice(f"model.{name}", getattr(self, name), choices)
-        checks.check_minimum("model", self, 0, "kl_weight", "weight_decay")
+        weights = ("weight_decay",) if self.kl_weight is None else ("kl_weight", "weight_decay")
+        checks.check_minimum("model", self, 0, *weights)
         checks.check_range("model.log_z_min", self.log_z_min, -math.inf, 0, open_high=True)
 
 
@@ -88,3 +94,20 @@ class SSGP:
     def __post_init__(self) -> None:
         checks.typed("model", self)
         checks.kind("model", self.kind, "ssgp")
+
+
+Model = BNN | GP | SSGP | Lagrangian
+
+
+def sized(model: Model, states: int) -> Model:
+    """A model's settings for a plant of so many states, with a number for each null: docs/decisions.md 0017."""
+    if isinstance(model, GP | SSGP):
+        return model
+    size = model.ensemble_size or (5 if states > 6 else 1)
+    own = 1.0 if size > 1 else 0.1
+    return replace(model, ensemble_size=size, kl_weight=own if model.kl_weight is None else model.kl_weight)
+
+
+def several(model: Model) -> int:
+    """How many models a sized one is."""
+    return 1 if isinstance(model, GP | SSGP) else model.ensemble_size or 1

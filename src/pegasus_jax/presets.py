@@ -82,23 +82,23 @@ DOUBLE_CARTPOLE_NETWORK = Config(
 )
 
 
-def swimmer(maneuver: str, legs: int) -> Config:
-    """The networks of docs/reference.md 3.4, five of them (docs/decisions.md 0017); README's search."""
+def swimmer_network(maneuver: str, legs: int) -> Config:
+    """The networks of docs/reference.md 3.4."""
     return Config(
         task=f"swimmer_{maneuver}",
         legs=legs,
         trials=50,
-        model=BNN(hidden=(200,) * 4, initializer="orthogonal", ensemble_size=5, kl_weight=1.0),
+        model=BNN(hidden=(200,) * 4, initializer="orthogonal"),
         policy=MLP(hidden=(200,) * 4, dropout=0.1, initializer="orthogonal"),
         fit=Fit(steps={2: 2000, 6: 4000}[legs]),
         search=Search(
             steps=500,
             particles=200,
-            cost_estimator="particles",  # so it was measured
+            cost_estimator="particles",
             cost_width_start=1.0,
             standardized_noise=True,
             refine_fraction=0.5,
-            init="fresh",  # docs/decisions.md 0016
+            init="fresh",
         ),
         explore=Explore(trials=2, kind="walk"),
     )
@@ -107,7 +107,7 @@ def swimmer(maneuver: str, legs: int) -> Config:
 # For any plant. The expectation of a cost of one's own is a mean over nodes: docs/decisions.md 0018. Such a plant may
 # start anywhere: 0024. It is to hold for longer than an episode: 0023.
 DEFAULT = Config(
-    model=BNN(hidden=(100, 100)),
+    model=BNN(hidden=(100, 100), ensemble_size=None, kl_weight=None),
     policy=SMALL_POLICY,
     search=Search(
         learning_rate=SMALL_POLICY_STEP,
@@ -119,9 +119,10 @@ DEFAULT = Config(
     successor="better",  # a robot runs a new policy only where it is expected to be better than the one before
 )
 
-_SWIMMERS = {
-    **{f"swimmer_{name}": swimmer(name, 2) for name in MANEUVERS},
-    **{f"swimmer_{name}_six_legs": swimmer(name, 6) for name in MANEUVERS},
+SWIMMERS = {
+    f"swimmer_{maneuver}{suffix}": (maneuver, legs)
+    for legs, suffix in ((2, ""), (6, "_six_legs"))
+    for maneuver in MANEUVERS
 }
 
 # With a Bayesian neural network as the paper has it: what `model=` and the paper's algorithms change.
@@ -136,10 +137,7 @@ NETWORKS: dict[str, Config] = {
         ),
     ),
     "double_cartpole_network": DOUBLE_CARTPOLE_NETWORK,
-    **{
-        f"{name}_network": replace(config, model=replace(config.model, ensemble_size=1, kl_weight=BNN.kl_weight))
-        for name, config in _SWIMMERS.items()
-    },
+    **{f"{name}_network": swimmer_network(*which) for name, which in SWIMMERS.items()},
 }
 
 FOR_ANY = ("default",)  # presets that any task can begin with
@@ -153,7 +151,10 @@ PRESETS: dict[str, Config] = {
         fit=replace(DOUBLE_CARTPOLE.fit, steps=3000),
         search=replace(DOUBLE_CARTPOLE.search, num_starts=8, particles=96, steps=2000),
     ),
-    **_SWIMMERS,
+    **{
+        name: replace(DEFAULT, task=f"swimmer_{maneuver}", legs=legs, trials=30)
+        for name, (maneuver, legs) in SWIMMERS.items()
+    },
     GYM: replace(DEFAULT, task=GYM),
     MJCF: replace(DEFAULT, task=MJCF),
     **NETWORKS,
@@ -184,7 +185,7 @@ MODELS: dict[str, Change] = {
     "concrete": _network(dropout="concrete"),
     "gaussian": _network(dropout="gaussian"),
     "sparse": _network(dropout="sparse"),
-    "deterministic": _network(dropout="none"),
+    "deterministic": _network(dropout="none", ensemble_size=1),
     "ensemble": _network(dropout="none", ensemble_size=5),
     "lagrangian": _lagrangian,
     "gp": lambda config: replace(config, model=GP(), fit=LBFGS(num_starts=10)),
@@ -204,7 +205,7 @@ def _papers(config: Config, **search: Any) -> Config:
     model, fit = config.model, config.fit
     assert isinstance(config.search, Search)
     if isinstance(model, BNN | Lagrangian):
-        model = replace(model, activation="relu", kl_weight=1.0)
+        model = replace(model, activation="relu", ensemble_size=model.ensemble_size or 1, kl_weight=1.0)
     if isinstance(fit, Fit):
         fit = replace(fit, learning_rate=1e-4)
     plain = dict(

@@ -70,6 +70,7 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
     shape: dict[str, Any] = dict(states=states, controls=controls + told, angles=task.angles)
     if task.hindsight is not None and isinstance(config, settings.GP | settings.SSGP):
         raise ConfigError("sensors.velocity= needs a model=lagrangian or another network; the nearest is history=2")
+    config = settings.sized(config, states)
     match config:
         case settings.GP():
             return gp(**shape)
@@ -87,7 +88,8 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
             # What a good simulator gets wrong may be all noise.
             head = HEADS["sigmoid" if task.prior is None else "softplus"]
             member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic, head=head)
-    model = ensemble(member, config.ensemble_size) if config.ensemble_size > 1 else member
+    size = settings.several(config)
+    model = ensemble(member, size) if size > 1 else member
     if task.hindsight is None:
         return model
     return corrected(model, rates=task.rates, inputs=controls)

@@ -17,7 +17,7 @@ from pegasus_jax.report import driven, read
 from pegasus_jax.report.curves import calibration, learning, trials
 from pegasus_jax.report.findings import findings, said
 from pegasus_jax.report.page import Section, data, downloads, facts, fold, table
-from pegasus_jax.report.read import Look
+from pegasus_jax.report.read import Look, model_of
 from pegasus_jax.report.tables import trajectories_csv, trials_csv
 from pegasus_jax.report.trajectories import fans, summary
 from pegasus_jax.runs import store
@@ -35,7 +35,7 @@ def title(found: Look) -> str:
 def lead(found: Look) -> str:
     """The lines below the title."""
     when = time.strftime("%Y-%m-%d %H:%M")
-    kinds = f"model {model_word(found.config.model)}, policy {found.config.policy.kind}"
+    kinds = f"model {model_word(model_of(found))}, policy {found.config.policy.kind}"
     return f'<p class="soft">{escape(kinds)}. Folder <code>{escape(str(found.path))}</code>, read {when}.</p>' + cards(
         found
     )

@@ -8,7 +8,8 @@ from html import escape
 from importlib import metadata
 from typing import Any, NamedTuple
 
-from pegasus_jax.report.read import Look, coverage
+from pegasus_jax.config import BNN, Lagrangian, several
+from pegasus_jax.report.read import Look, coverage, model_of
 from pegasus_jax.runs.store import cost_since
 from pegasus_jax.runs.stuck import AT_LIMITS, stuck
 
@@ -60,9 +61,11 @@ def _model(found: Look) -> Iterator[Finding]:
     known = [(row["trial"], row["calibration"]) for row in found.rows if row.get("calibration") is not None]
     if known and known[-1][1] > TOO_SURE:
         trial, ratio = known[-1]
+        alone = isinstance(model := model_of(found), BNN | Lagrangian) and several(model) == 1
+        then = ", then model.ensemble_size=5" if alone else ""
         means = (
             "The model claims to know more than it does, so imagined costs are too good. This is usual in the first"
-            " trials. If it stays after five, give more trials, then model=ensemble."
+            f" trials. If it stays after five, give more trials{then}."
         )
         yield Finding("warning", f"trial {trial}: model errors {ratio:.1f} times as large as predicted", means)
     elif known and known[-1][1] < TOO_UNSURE:

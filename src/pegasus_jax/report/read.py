@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pegasus_jax.checks import ConfigError, RunError
-from pegasus_jax.config import Config
+from pegasus_jax.config import Config, Model, sized
 from pegasus_jax.episode import Episode
 from pegasus_jax.presets import own
 from pegasus_jax.runs import config_io, driven, restore, store
@@ -83,6 +83,11 @@ def _driven(path: Path, problems: list[str]) -> list[driven.Driven]:
         except RunError as error:
             problems.append(str(error))
     return logs
+
+
+def model_of(found: Look) -> Model:
+    """The settings of its model, with a number for each that the plant's states decide."""
+    return sized(found.config.model, len(found.task.state_names))
 
 
 def names(task: Task) -> list[str]:

@@ -113,7 +113,12 @@ def lasting(task: Task) -> list[str]:
 
 def unsaid(given: Config, known: Config, task: Task) -> list[str]:
     """Notes on what the user did not say of an environment, and what is taken for it; `known` is what is."""
-    return assumed.notes(given) + assumed.rotations(given, task) + circles_found(given, known)
+    return (
+        assumed.notes(given)
+        + assumed.rotations(given, task)
+        + circles_found(given, known)
+        + assumed.networks(given.model, len(task.state_names))
+    )
 
 
 def circles_found(given: Config, known: Config) -> list[str]:

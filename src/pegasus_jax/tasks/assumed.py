@@ -4,7 +4,7 @@ from contextlib import suppress
 
 import numpy as np
 
-from pegasus_jax.config import GYM, MJCF, Config
+from pegasus_jax.config import GYM, MJCF, Config, Model, several, sized
 from pegasus_jax.task import Task
 
 
@@ -41,6 +41,15 @@ def rotations(given: Config, task: Task) -> list[str]:
         " is not quite a rotation; hinges have angles, and observe= can leave it out"
         for joint, entries in found.items()
     ]
+
+
+def networks(model: Model, states: int) -> list[str]:
+    """The note that a plant of so many states gets several models where the user did not say how many; or none."""
+    size = several(sized(model, states))
+    if size == several(model):
+        return []
+    said = f"{states} states: the model is {size} networks, of which each imagined episode follows one; one alone is"
+    return [f"{said} too sure of itself, model.ensemble_size=1 takes it"]
 
 
 def period(given: Config) -> list[str]:
