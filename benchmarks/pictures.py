@@ -43,7 +43,11 @@ RUNS = {
         "task=double_cartpole search.steps=604 search.warm_restart=0 search.warm_limit_factor=1 seed=4 trials=21",
         4,  # one that succeeds: not half of them do
     ),
-    "swimmer": ("task=swimmer_knife_edge seed=27 trials=8", 1),
+    "swimmer": (
+        "preset=swimmer_knife_edge_network task=swimmer_knife_edge model.ensemble_size=5 model.kl_weight=1"
+        " seed=27 trials=8",
+        1,
+    ),
 }
 SMALLER = 2  # times, than the films of pegasus-play
 SMALL = ["-crf", "33", "-preset", "veryslow", "-movflags", "+faststart"]  # of ffmpeg: a page waits for no film

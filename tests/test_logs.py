@@ -307,7 +307,7 @@ def test_the_data_are_those_of_add_episode(tmp_path):
     assert state.data.x.shape == (1024, 2)  # room for 4 * 8 + 12 rows, and more
     data = jax.tree.map(lambda leaf: leaf[None], dataset.empty(40, 2, 1))
     counts = jnp.zeros(1, int)
-    states = RunState(None, data, None, None, counts, counts, counts > 0)  # type: ignore[arg-type]
+    states = RunState(None, data, None, None, counts, counts, counts > 0, None, counts)  # type: ignore[arg-type]
     found = logged.added(states, logs, experiment)
     one = dataset.empty(40, 2, 1)
     for log in logs:

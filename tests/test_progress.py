@@ -65,6 +65,8 @@ def test_a_trial_in_one_line() -> None:
             "policy now",
         ),
         ({"replaced": False}, "policy kept: cost 0.310", "policy now"),
+        ({"replaced": False, "policy": 3, "policy_next": 3}, "policy kept: cost 0.310", "policy of trial 3 again"),
+        ({"replaced": False, "policy": 4, "policy_next": 3}, "policy of trial 3 again: cost 0.310", "policy kept"),
         ({"skipped_updates": 3}, "3 updates skipped", "None"),
         (
             {"seconds": {"compile": 5.0, "between_episodes": 1.5}},

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,7 @@ from pegasus_jax.learn.data import grow
 from pegasus_jax.runs import checkpoint, config_io, evaluation, restore, store
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.viz.video import film
+from probes import same
 from test_train import call
 
 
@@ -247,3 +249,18 @@ def test_a_model_that_was_moved_is_known_by_its_content(tmp_path: Path, monkeypa
         restore.planted(run, now)
     with pytest.raises(ConfigError, match="of no use here"):
         restore.moved(run, config_io.parse({"task": "cartpole"}), "new.xml")
+
+
+def test_a_run_of_an_older_version_has_no_policy_to_go_back_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its checkpoints do not say which policy worked."""
+    today = checkpoint._named
+
+    def older(tree: Any, prefix: str = "") -> dict[str, Any]:
+        return {name: leaf for name, leaf in today(tree, prefix).items() if not name.startswith(("working", "succ"))}
+
+    with monkeypatch.context() as before:
+        before.setattr(checkpoint, "_named", older)
+        older_run = a_run(tmp_path / "run", trials=1)
+    state = restore.restored(older_run)[2]
+    assert (int(state.working_trial), bool(state.succeeded)) == (0, False)
+    assert same(state.working, state.policy.params)

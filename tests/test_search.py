@@ -355,6 +355,26 @@ def test_what_works_is_refined_but_in_the_first_second_fourth_eighth_search(init
     assert run._cache_size() == 1
 
 
+@pytest.mark.parametrize(
+    ("given", "iterations"),
+    [
+        ([1, 2, 1, 1, 1, 1], [6, 2, 2, 2, 6, 2]),
+        ([1, 1, 2, 1, 1], [6, 6, 2, 6, 2]),
+        ([1, 2, 2, 2], [6, 2, 2, 2]),
+        ([0, 1, 1, 1, 1, 2], [6, 6, 6, 2, 6, 2]),
+    ],
+)
+def test_where_what_replaced_it_has_failed_a_policy_is_only_refined(given, iterations):
+    """2 says so; whole searches are rarer from then on."""
+    found, learner = on_table(search_table(6, init="better", refine=4), optax.adam(0.1), value=rowless)
+    run, done = jax.jit(partial(found.run, steps=6, fresh=jnp.zeros((2, 3)))), []
+    for works in given:
+        learner, info = run(jax.random.key(7), learner, 1.0, first=0, works=jnp.int32(works))
+        done.append(int(info.iterations))
+    assert done == iterations
+    assert run._cache_size() == 1
+
+
 @pytest.mark.parametrize(("works", "starts"), [(False, 1.0), (True, 9.0)])
 def test_a_whole_search_that_is_given_what_works_begins_with_a_fresh_policy_and_ends_with_the_better(works, starts):
     """Here the fresh one costs more, and steps do not move it."""

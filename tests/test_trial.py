@@ -10,7 +10,8 @@ import pytest
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.config import Period
 from pegasus_jax.experiment import COLLECT, EVALUATE, FIT, IMAGINE, RESTART, SEARCH, TrialInfo, run, trial_key
-from pegasus_jax.types import Policy, Prediction
+from pegasus_jax.learn.successor import after_episode
+from pegasus_jax.types import Policy, Prediction, RunState, TrainState
 from probes import Counter, Linear, cart, dial, known, noisy_linear_policy, regression, same, tiny, unchecked
 
 TRIALS, EPISODES = 3, 4
@@ -368,6 +369,55 @@ def test_a_state_says_whether_its_newest_episode_succeeded(watched, looped, leng
     added = watched.exp.add_episode(state, trajectory._replace(cost=jnp.zeros(8), length=length))
     assert bool(added.succeeded) == succeeds
     assert not bool(watched.exp.add_episode(added, trajectory._replace(cost=jnp.ones(8))).succeeded)
+
+
+# (trial after which the policy that runs was learned, whether its episode succeeds) one after the other, and then
+# (trial of the policy that goes on, whether it counts as one that works, trial of the one to go back to).
+EPISODES = {
+    "none worked": ([(1, False), (2, False)], (2, False, 0)),
+    "random controls are nobody's success": ([(0, True), (1, False)], (1, False, 0)),
+    "one works": ([(1, True)], (1, True, 1)),
+    "it goes on and works again": ([(1, True), (1, True)], (1, True, 1)),
+    "it goes on and fails": ([(1, True), (1, False)], (1, False, 0)),
+    "the next works too": ([(1, True), (2, True)], (2, True, 2)),
+    "the next fails": ([(1, True), (2, False)], (1, True, 0)),
+    "the one after that fails too": ([(1, True), (2, False), (3, False)], (3, False, 0)),
+    "the next fails and the one gone back to works": ([(1, True), (2, False), (1, True)], (1, True, 1)),
+    "and may be gone back to again": ([(1, True), (2, False), (1, True), (4, False)], (1, True, 0)),
+}
+
+
+@pytest.mark.parametrize("name", EPISODES)
+def test_a_policy_that_worked_comes_back_where_the_next_one_fails(name):
+    """Once: docs/decisions.md 0021. Under vmap as alone, because the runs of many seeds are one program."""
+    ran, (goes_on, works, remembered) = EPISODES[name]
+    learner = TrainState(jnp.zeros(2), None)
+    state = RunState(None, None, None, learner, *map(jnp.int32, (0, 0)), jnp.bool_(False), learner.params, jnp.int32(0))
+    state = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)
+    for trial, succeeds in ran:
+        new = jnp.full((2, 2), 1.0 * trial)
+        state = state._replace(policy=TrainState(new, None), policy_trial=jnp.full(2, trial, jnp.int32))
+        state = jax.jit(jax.vmap(after_episode))(state._replace(succeeded=jnp.full(2, succeeds)))
+    assert state.policy_trial.tolist() == [goes_on] * 2
+    assert np.all(np.asarray(state.policy.params) == goes_on)
+    assert state.succeeded.tolist() == [works] * 2
+    assert state.working_trial.tolist() == [remembered] * 2
+    assert not remembered or np.all(np.asarray(state.working) == remembered)
+
+
+@pytest.mark.parametrize("compare", ["better", "always"])
+def test_a_run_goes_back_only_where_it_compares(compare):
+    """An episode of 8 periods that fail, after another policy has worked."""
+    task = cart()
+    exp = compose(tiny(**QUICK, successor=compare), task, policy=noisy_linear_policy(task))
+    good, bad = jnp.full((1, 2), -0.5), jnp.full((1, 2), 0.5)
+    state = exp.init(jax.random.key(0))
+    state = state._replace(policy=state.policy._replace(params=bad), trial=jnp.int32(3), policy_trial=jnp.int32(2))
+    state = state._replace(working=good, working_trial=jnp.int32(1))
+    fails = exp.collect(state)._replace(cost=jnp.ones(8))
+    after = exp.add_episode(state, fails)
+    assert same(after.policy.params, good if compare == "better" else bad)
+    assert (int(after.policy_trial), bool(after.succeeded)) == ((1, True) if compare == "better" else (2, False))
 
 
 def test_an_episode_that_is_none_of_the_tasks_is_refused(watched, looped):

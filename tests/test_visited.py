@@ -28,7 +28,17 @@ def rows(size, capacity=700):
 
 def run_state(data, succeeded=True):
     nothing = TrainState(None, None)
-    return RunState(jax.random.key(0), data, nothing, nothing, jnp.int32(1), jnp.int32(1), jnp.bool_(succeeded))
+    return RunState(
+        jax.random.key(0),
+        data,
+        nothing,
+        nothing,
+        jnp.int32(1),
+        jnp.int32(1),
+        jnp.bool_(succeeded),
+        nothing.params,
+        jnp.int32(0),
+    )
 
 
 def remembered(data, succeeded=True, angles=(), varies=ALL):

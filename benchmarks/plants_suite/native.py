@@ -38,14 +38,16 @@ def returns(control: Any, env: Any, least: int = 10, most: int = MOST) -> tuple[
 
 def scores(run: Path, name: str, most: int = MOST) -> list[dict[str, Any]]:
     """One row for each trial that has a policy and a row of its own."""
-    env, rows = gymnasium.make(name), []
+    env, rows, judged = gymnasium.make(name), [], dict[int, tuple[list[float], list[int]]]()
     seen = list(config_io.load(run / "config.yaml").sensors.measured) or slice(None)
     for row in store.trials(run):
         if row["trial"] not in checkpoint.available(run):
             continue
-        if not rows or row["replaced"] is not False:  # else it is the policy of before
+        learned = row.get("policy_next") or row["trial"]  # after which trial: a policy may go on, or come back
+        if learned not in judged:
             control = controller(run, trial=row["trial"])
-            totals, lengths = returns(lambda x, control=control: control(x[seen]), env, most=most)
+            judged[learned] = returns(lambda x, control=control: control(x[seen]), env, most=most)
+        totals, lengths = judged[learned]
         told = {key: row[key] for key in ("trial", "plant_seconds", "policy", "episode_cost", "objective_fresh")}
         rows.append(told | {"native": round(float(np.mean(totals)), 3), "returns": totals, "lengths": lengths})
     return rows

@@ -16,6 +16,7 @@ from pegasus_jax.imagine import limits
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
+from pegasus_jax.learn.successor import after_episode
 from pegasus_jax.models.calibration import calibration
 from pegasus_jax.policies.driver import driver
 from pegasus_jax.policies.rate_limited import before, explored, with_state
@@ -136,6 +137,8 @@ def experiment(
             jnp.int32(0),
             jnp.int32(0),
             jnp.bool_(False),
+            controller,
+            jnp.int32(0),
         )
 
     def act(params: Params, key: Key, x: Array) -> Array:
@@ -181,7 +184,8 @@ def experiment(
         check_episode(state, trajectory, controls)
         ran, m = as_modeled(trajectory)
         data = dataset.add(state.data, ran, task.angles, m)
-        return state._replace(data=data, trial=state.trial + 1, succeeded=episode.works(trajectory, task))
+        state = state._replace(data=data, trial=state.trial + 1, succeeded=episode.works(trajectory, task))
+        return after_episode(state) if compare else state
 
     def as_modeled(trajectory: Trajectory) -> tuple[Trajectory, Array | None]:
         """An episode as the model learns it, with its states and controls [H, V], and what was remembered [H+1, M]."""
@@ -220,6 +224,7 @@ def experiment(
         fresh = jax.vmap(lambda key: adapted(policy.init(key), state.data))(keys)
         untrained = (state.trial <= first_search) & (first == 0)
         worked = state.succeeded & (state.policy_trial > 0)  # a policy, and not random controls
+        came_back = worked & (state.working_trial == 0) if compare else False  # `after_episode`
         given = state.policy.params  # one that has learned keeps the inputs that it has learned with
         if not begun:
             given = optax.tree.where(untrained, adapted(given, state.data), given)
@@ -231,7 +236,7 @@ def experiment(
             earlier=jnp.maximum(state.trial - first_search, 0),
             steps=steps,
             fresh=fresh,
-            **({"works": worked} if refine_successes else {}),
+            **({"works": worked + jnp.int32(came_back)} if refine_successes else {}),
         )
         return state._replace(policy=learner), info
 

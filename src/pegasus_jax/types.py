@@ -182,8 +182,8 @@ class PolicyOptimizer(NamedTuple):
     init: Callable[[Params], Any]  # parameters -> the optimizer's state
     # (key, learner, posterior, steps=, first=, earlier=, fresh=) -> (learner, SearchInfo): iterations first .. first +
     # steps - 1 of the search after `earlier` others; `fresh` are those of some that know nothing [2, ...], with
-    # policies side by side of more. One that refines also takes works=, whether the given policy succeeded in the
-    # newest episode
+    # policies side by side of more. One that refines also takes works=, whether the given policy succeeded in its
+    # newest episode; 2: and one that took its place has failed since
     run: Callable[..., tuple[TrainState, Any]]
 
 
@@ -196,4 +196,6 @@ class RunState(NamedTuple):
     policy: TrainState
     trial: Array  # [] int32, episodes added so far
     policy_trial: Array  # [] int32, the trial after which this policy was learned; 0: it has learned nothing yet
-    succeeded: Array  # [] bool, whether the newest episode did
+    succeeded: Array  # [] bool, whether the newest episode of this policy did
+    working: Params  # of a policy whose newest episode succeeded, to go back to: learn/successor.py
+    working_trial: Array  # [] int32, the trial after which that was learned; 0: there is none

@@ -24,7 +24,7 @@ class Problem(NamedTuple):
     sampler: Sampler
     optimizer: optax.GradientTransformation  # any of optax
     table: SearchTable
-    works: Array | bool = False  # [] whether the policy that a search is given works
+    works: Array | bool = False  # [] whether the policy that a search is given works; 2: another has failed since
     reset_optimizer: bool = True  # whether each search starts with a new optimizer state
     # What a constraint makes of its multiplier; None: there is none. With it the objective's last argument is the
     # multiplier, and it returns (value, probability).

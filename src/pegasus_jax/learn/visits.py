@@ -50,7 +50,10 @@ def renewed(problem: Any, learner: TrainState) -> TrainState:
     """The learner of a search that begins: it forgets what belonged to the one before."""
     params, state = learner
     optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
-    worked = jnp.where(problem.works, state.worked + 1, 0)
+    count = state.worked + 1
+    # What a fresh start found has just failed on the plant: the next search only refines, and others are rarer.
+    count = jnp.where(jnp.asarray(problem.works) > 1, 2 * count + 1, count)
+    worked = jnp.where(problem.works, count, 0)
     new = dict(optimizer=optimizer, start=params, worked=worked, progress=unrefined(), widening=jnp.ones((), float))
     return TrainState(params, state._replace(**new))
 

@@ -75,7 +75,7 @@ def restore(run: Path, trial: int, like: RunState) -> RunState:
         except Exception as error:  # orbax raises many kinds for what it cannot read
             raise RunError(f"{folder} is of another version: orbax cannot read it as ours") from error
     stored |= {name: np.zeros(leaf.shape, leaf.dtype) for name, leaf in _named(like).items() if not leaf.size}
-    stored.setdefault("succeeded", np.zeros((), bool))  # older runs did not keep it
+    stored = _of_today(stored)
     stored |= _shortened(stored, len(like.data.x))
     optimizers = {"model": like.model.optimizer, "policy": like.policy.optimizer}
     rest = like._replace(model=like.model._replace(optimizer=None), policy=like.policy._replace(optimizer=None))
@@ -136,6 +136,16 @@ def _named(tree: Any, prefix: str = "") -> dict[str, Any]:
     """Name -> leaf of a tree, as `model.params.network.kernel`."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return {prefix + jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+
+
+def _of_today(stored: dict[str, Any]) -> dict[str, Any]:
+    """The leaves with those that older runs did not keep: no episode of theirs succeeded, and none is gone back to."""
+    working = {
+        f"working{name.removeprefix('policy.params')}": leaf
+        for name, leaf in stored.items()
+        if name.startswith("policy.params")
+    }
+    return {"succeeded": np.zeros((), bool), "working_trial": np.zeros((), np.int32)} | working | stored
 
 
 def _shortened(stored: dict[str, Any], room: int) -> dict[str, Any]:

@@ -302,11 +302,17 @@ def learned(rows: Sequence[dict[str, Any]]) -> str:
         parts += [f"cost {_mean(rows, 'mean_cost'):.3f}", f"success {_mean(rows, 'success_rate'):.0%}"]
     if (imagined := _mean(rows, "objective_fresh")) is not None:
         parts.append(f"imagined cost {imagined:.3f}")
+    return f"{which_policy(rows)}: {', '.join(parts)}" if parts else ""
+
+
+def which_policy(rows: Sequence[dict[str, Any]]) -> str:
+    """What there is to say of the policies that go on: new ones, those that ran, or one that worked before that."""
     if all(row.get("policy") == 0 and row["objective_fresh"] is None for row in rows):
-        which = "first policy, before any search"
-    else:
-        which = "policy kept" if all(row.get("replaced") is False for row in rows) else "policy now"
-    return f"{which}: {', '.join(parts)}" if parts else ""
+        return "first policy, before any search"
+    if not all(row.get("replaced") is False for row in rows):
+        return "policy now"
+    back = rows[0].get("policy_next")
+    return "policy kept" if len(rows) > 1 or back in (None, rows[0]["policy"]) else f"policy of trial {back} again"
 
 
 def skipped(rows: Sequence[dict[str, Any]]) -> str:

@@ -42,6 +42,7 @@ UNKNOWN: dict[str, Any] = {
     "objective_fresh": None,
     "objective_incumbent": None,
     "replaced": None,
+    "policy_next": None,
     "gradient_norm": None,
     "iterations": 0,
     "skipped_updates": 0,
@@ -282,7 +283,7 @@ def improved(
     reached, done = last(found), iterations(found)
     skipped = fitted.skipped + sum(f.skipped for f in found)
     states, successor = program("succeed", states, incumbents, purpose="imagine")
-    successor = gather(successor)
+    successor, goes_on = gather((successor, states.policy_trial))
     job.writer.imagined(trial, successor)
     return states, [
         {
@@ -292,6 +293,7 @@ def improved(
             "objective_fresh": float(np.mean(successor.cost[index])),
             "objective_incumbent": known(successor.incumbent[index]),
             "replaced": bool(successor.replaced[index]),
+            "policy_next": int(goes_on[index]),
             "gradient_norm": float(np.median(norm[index, : done[index]])),
             "iterations": int(done[index]),
             "skipped_updates": int(skipped[index]),
