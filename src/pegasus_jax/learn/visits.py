@@ -51,7 +51,7 @@ def renewed(problem: Any, learner: TrainState) -> TrainState:
     params, state = learner
     optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
     count = state.worked + 1
-    # What a fresh start found has just failed on the plant: the next search only refines, and others are rarer.
+    # What took its place has just failed on the plant: this search only refines, and whole ones are rarer from now on.
     count = jnp.where(jnp.asarray(problem.works) > 1, 2 * count + 1, count)
     worked = jnp.where(problem.works, count, 0)
     new = dict(optimizer=optimizer, start=params, worked=worked, progress=unrefined(), widening=jnp.ones((), float))

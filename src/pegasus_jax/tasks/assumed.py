@@ -48,8 +48,8 @@ def networks(model: Model, states: int) -> list[str]:
     size = several(sized(model, states))
     if size == several(model):
         return []
-    said = f"{states} states: the model is {size} networks, of which each imagined episode follows one; one alone is"
-    return [f"{said} too sure of itself, model.ensemble_size=1 takes it"]
+    said = f"{states} states: the model is {size} networks, and each imagined episode follows one of them"
+    return [f"{said}; model.ensemble_size=1 takes one alone, which is often too sure of itself"]
 
 
 def period(given: Config) -> list[str]:
