@@ -7,7 +7,8 @@ import pytest
 
 from pegasus_jax.assembly.pieces import dynamics_of, policy_of
 from pegasus_jax.assembly.searchers import blocks_of
-from pegasus_jax.config import BNN, GP, MLP, Lagrangian, model_word, sized
+from pegasus_jax.config import BNN, GP, MLP, Lagrangian, model_word
+from pegasus_jax.config_models import sized
 from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.tasks import assumed

@@ -373,7 +373,7 @@ def test_a_state_says_whether_its_newest_episode_succeeded(watched, looped, leng
 
 # (trial after which the policy that runs was learned, whether its episode succeeds) one after the other, and then
 # (trial of the policy that goes on, whether it counts as one that works, trial of the one to go back to).
-EPISODES = {
+RAN = {
     "none worked": ([(1, False), (2, False)], (2, False, 0)),
     "random controls are nobody's success": ([(0, True), (1, False)], (1, False, 0)),
     "one works": ([(1, True)], (1, True, 1)),
@@ -387,10 +387,10 @@ EPISODES = {
 }
 
 
-@pytest.mark.parametrize("name", EPISODES)
+@pytest.mark.parametrize("name", RAN)
 def test_a_policy_that_worked_comes_back_where_the_next_one_fails(name):
     """Once: docs/decisions.md 0021. Under vmap as alone, because the runs of many seeds are one program."""
-    ran, (goes_on, works, remembered) = EPISODES[name]
+    ran, (goes_on, works, remembered) = RAN[name]
     learner = TrainState(jnp.zeros(2), None)
     state = RunState(None, None, None, learner, *map(jnp.int32, (0, 0)), jnp.bool_(False), learner.params, jnp.int32(0))
     state = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), state)

@@ -12,12 +12,12 @@ from typing import Any
 
 from pegasus_jax import checks
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.config_models import BNN, GP, SSGP, Lagrangian, Model, setting, several, sized
+from pegasus_jax.config_models import BNN, GP, SSGP, Lagrangian, Model, setting, several
 from pegasus_jax.config_plant import EVERY, Explore, Sensors
 from pegasus_jax.config_policies import MLP, RBF, Linear
 
 __all__ = ["BNN", "GP", "LBFGS", "MLP", "RBF", "SSGP", "Analytic", "Config", "Explore", "Fit", "Lagrangian", "Linear"]
-__all__ += ["Model", "Period", "Search", "Sensors", "several", "sized"]
+__all__ += ["Period", "Search", "Sensors"]
 
 MANEUVERS = ("knife_edge", "belly_up", "corkscrew", "depth_change")
 GYM = "gym"  # the task that `env=` and `cost=` describe

@@ -181,9 +181,8 @@ class PolicyOptimizer(NamedTuple):
 
     init: Callable[[Params], Any]  # parameters -> the optimizer's state
     # (key, learner, posterior, steps=, first=, earlier=, fresh=) -> (learner, SearchInfo): iterations first .. first +
-    # steps - 1 of the search after `earlier` others; `fresh` are those of some that know nothing [2, ...], with
-    # policies side by side of more. One that refines also takes works=, whether the given policy succeeded in its
-    # newest episode; 2: and one that took its place has failed since
+    # steps - 1 of the search after `earlier` others; `fresh` are of some that know nothing [2, ...], or more. One that
+    # refines takes works=, whether the given policy's newest episode succeeded; 2: and its successor has failed since
     run: Callable[..., tuple[TrainState, Any]]
 
 

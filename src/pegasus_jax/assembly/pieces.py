@@ -10,6 +10,7 @@ from pegasus_jax import config as settings
 from pegasus_jax import tasks
 from pegasus_jax.assembly.searchers import first_seen, limits
 from pegasus_jax.checks import ConfigError
+from pegasus_jax.config_models import several, sized
 from pegasus_jax.learn.fit import falling, minibatches
 from pegasus_jax.math import angles, gaussian
 from pegasus_jax.memory import given_size, seen_angles, seen_names
@@ -70,7 +71,7 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
     shape: dict[str, Any] = dict(states=states, controls=controls + told, angles=task.angles)
     if task.hindsight is not None and isinstance(config, settings.GP | settings.SSGP):
         raise ConfigError("sensors.velocity= needs a model=lagrangian or another network; the nearest is history=2")
-    config = settings.sized(config, states)
+    config = sized(config, states)
     match config:
         case settings.GP():
             return gp(**shape)
@@ -88,7 +89,7 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
             # What a good simulator gets wrong may be all noise.
             head = HEADS["sigmoid" if task.prior is None else "softplus"]
             member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic, head=head)
-    size = settings.several(config)
+    size = several(config)
     model = ensemble(member, size) if size > 1 else member
     if task.hindsight is None:
         return model

@@ -8,7 +8,7 @@ from html import escape
 from importlib import metadata
 from typing import Any, NamedTuple
 
-from pegasus_jax.config import BNN, Lagrangian, several
+from pegasus_jax.config_models import BNN, Lagrangian, several
 from pegasus_jax.report.read import Look, coverage, model_of
 from pegasus_jax.runs.store import cost_since
 from pegasus_jax.runs.stuck import AT_LIMITS, stuck

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pegasus_jax.checks import ConfigError, RunError
-from pegasus_jax.config import Config, Model, sized
+from pegasus_jax.config import Config
+from pegasus_jax.config_models import Model, sized
 from pegasus_jax.episode import Episode
 from pegasus_jax.presets import own
 from pegasus_jax.runs import config_io, driven, restore, store

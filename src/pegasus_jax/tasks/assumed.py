@@ -4,7 +4,8 @@ from contextlib import suppress
 
 import numpy as np
 
-from pegasus_jax.config import GYM, MJCF, Config, Model, several, sized
+from pegasus_jax.config import GYM, MJCF, Config
+from pegasus_jax.config_models import Model, several, sized
 from pegasus_jax.task import Task
 
 
