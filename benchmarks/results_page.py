@@ -61,7 +61,9 @@ def section(figure: Figure, out: Path) -> str:
         parts.append(f"**Here.** {figure.found}")
     if (out / f"{figure.name}.png").exists():
         parts.append(f"![{figure.title}]({os.path.relpath(out / f'{figure.name}.png', PAGE.parent)})")
-    parts += [claims.markdown(claims.variants_table(figure, out)), claims.markdown(claims.claims_table(figure, out))]
+    parts.append(claims.markdown(claims.variants_table(figure, out)))
+    if figure.claims:
+        parts.append(claims.markdown(claims.claims_table(figure, out)))
     return "\n\n".join(parts) + "\n"
 
 

@@ -21,6 +21,7 @@ import pytest
 
 import benchmarks
 from benchmarks import RESULTS, pictures, readme_table, results_page, searches, study
+from benchmarks.paper import figures
 from benchmarks.plants_suite import batched
 from benchmarks.robot import costs
 from benchmarks.speed import compare, scaling, timing
@@ -280,6 +281,12 @@ def test_a_page_has_what_the_program_prints(page):
         "page": lambda: results_page.page(results_page.FIGURES, RESULTS),
     }
     assert text.split(results_page.BEGIN)[1].split(results_page.END)[0] == made[page]()
+
+
+@pytest.mark.parametrize("path", results_page.FIGURES.glob("*.toml"), ids=lambda path: path.stem)
+def test_a_figure_without_claims_has_no_table_of_them(path):
+    figure = figures.read(path)
+    assert ("| claim" in results_page.section(figure, RESULTS)) == bool(figure.claims)
 
 
 @pytest.mark.parametrize("row", readme_table.ROWS + readme_table.MORE, ids=lambda row: row.studies[0])
