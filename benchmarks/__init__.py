@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from pegasus_jax.checks import ConfigError, RunError
+from pegasus_jax.cli import help
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -15,10 +16,10 @@ def command(main: Callable[[list[str]], int | None], what: str | None) -> None:
     What cannot be run is one line and the exit status 1.
     """
     words = sys.argv[1:]
-    if {"--help", "-h", "help"} & set(words):
-        print(what)
-        return
     try:
+        if help.asked(words):
+            print(what)
+            return
         status = main(words)
     except (ConfigError, RunError) as error:
         sys.exit(f"{_name(Path(sys.argv[0]))}: {error}")

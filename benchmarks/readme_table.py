@@ -16,7 +16,7 @@ from benchmarks.paper import claims
 from benchmarks.paper.comparison import Result
 from benchmarks.paper.comparison import stored as read
 from pegasus_jax.config import MANEUVERS
-from pegasus_jax.presets import PRESETS
+from pegasus_jax.presets import PRESETS, own
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.study import SOLVED
 
@@ -46,8 +46,8 @@ ROWS = (
     Row("double cart-pole, eight policies, on a GPU", "double_cartpole_gpu", ("double_cartpole-reheated",)),
     Row("double cart-pole, one policy", "double_cartpole", ("double_cartpole-default",)),
     *(
-        Row(f"swimmer, {name.replace('_', ' ')}{legs}", f"swimmer_{name}{preset}", (f"{files}-{name}",))
-        for legs, preset, files in (("", "", "swimmer"), (", six legs", "_six_legs", "six_legs"))
+        Row(f"swimmer, {name.replace('_', ' ')}{words}", own(f"swimmer_{name}", legs), (f"{files}-{name}",))
+        for legs, words, files in ((2, "", "swimmer"), (6, ", six legs", "six_legs"))
         for name in MANEUVERS
     ),
 )

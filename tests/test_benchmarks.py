@@ -229,8 +229,8 @@ def test_a_peer_that_does_other_work_is_refused(found):
 
 
 COMMANDS = sorted(
-    ".".join(file.relative_to(Path(benchmarks.__path__[0]).parent).with_suffix("").parts).removesuffix(".__main__")
-    for file in Path(benchmarks.__path__[0]).rglob("*.py")
+    ".".join(file.relative_to(RESULTS.parents[1]).with_suffix("").parts).removesuffix(".__main__")
+    for file in RESULTS.parent.rglob("*.py")
     if "    command(" in file.read_text()
 )
 

@@ -70,6 +70,8 @@ def test_tasks_bring_their_defaults() -> None:
             assert (config.model.dropout, config.model.ensemble_size) == ("log_normal", 1)
             assert (config.search.particles, config.search.learning_rate, config.fit.steps) == (200, 1e-3, steps)
         assert [config.model.kl_weight for config in named] == [0.1, 1]
+    assert (named[0].trials, parse(*words, "model=log_normal", "trials=8").trials) == (50, 8)
+    assert parse("task=swimmer_belly_up", "policy=mlp").policy.dropout == 0
     assert parse("task=swimmer_belly_up", "algorithm=deep_pilco").search.particles == 10
 
 

@@ -215,8 +215,6 @@ def table(rows: dict[str, Row]) -> str:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    if not words or {"--help", "-h"} & set(words):
-        sys.exit(__doc__)
     folders = [Path(word).resolve() for word in words if "=" not in word]
     if len(folders) != 2:
         sys.exit(f"name two checkouts, OLD and NEW, not {len(folders)}")
@@ -242,4 +240,9 @@ def main(words: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    serve(sys.argv[2]) if sys.argv[1:2] == ["serve"] else main(sys.argv[1:])
+    if sys.argv[1:2] == ["serve"]:
+        serve(sys.argv[2])
+    else:
+        from benchmarks import command  # here: serving, this file belongs to another checkout
+
+        command(main, __doc__)

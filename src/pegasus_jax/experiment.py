@@ -16,7 +16,7 @@ from pegasus_jax.imagine import limits
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
-from pegasus_jax.learn.successor import after_episode
+from pegasus_jax.learn.successor import after_episode, came_back
 from pegasus_jax.models.calibration import calibration
 from pegasus_jax.policies.driver import driver
 from pegasus_jax.policies.rate_limited import before, explored, with_state
@@ -224,7 +224,6 @@ def experiment(
         fresh = jax.vmap(lambda key: adapted(policy.init(key), state.data))(keys)
         untrained = (state.trial <= first_search) & (first == 0)
         worked = state.succeeded & (state.policy_trial > 0)  # a policy, and not random controls
-        came_back = worked & (state.working_trial == 0) if compare else False  # `after_episode`
         given = state.policy.params  # one that has learned keeps the inputs that it has learned with
         if not begun:
             given = optax.tree.where(untrained, adapted(given, state.data), given)
@@ -236,7 +235,7 @@ def experiment(
             earlier=jnp.maximum(state.trial - first_search, 0),
             steps=steps,
             fresh=fresh,
-            **({"works": worked + jnp.int32(came_back)} if refine_successes else {}),
+            **({"works": worked + jnp.int32(compare & came_back(state))} if refine_successes else {}),
         )
         return state._replace(policy=learner), info
 

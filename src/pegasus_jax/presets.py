@@ -29,6 +29,7 @@ from pegasus_jax.config import (
     Period,
     Search,
 )
+from pegasus_jax.config_models import several
 
 # A plant of few dimensions needs no more, and narrow layers larger steps: docs/decisions.md 0037.
 SMALL_POLICY, SMALL_POLICY_STEP = MLP(hidden=(64, 64)), 3e-3
@@ -82,6 +83,11 @@ DOUBLE_CARTPOLE_NETWORK = Config(
 )
 
 
+def own(task: str, legs: int = 2) -> str:
+    """The name of the preset that a task begins with, for a swimmer by the legs that it drives."""
+    return f"{task}_six_legs" if legs == 6 else task
+
+
 def swimmer_network(maneuver: str, legs: int) -> Config:
     """The networks of docs/reference.md 3.4."""
     return Config(
@@ -119,11 +125,7 @@ DEFAULT = Config(
     successor="better",  # a robot runs a new policy only where it is expected to be better than the one before
 )
 
-SWIMMERS = {
-    f"swimmer_{maneuver}{suffix}": (maneuver, legs)
-    for legs, suffix in ((2, ""), (6, "_six_legs"))
-    for maneuver in MANEUVERS
-}
+SWIMMERS = {own(f"swimmer_{name}", legs): (name, legs) for legs in (2, 6) for name in MANEUVERS}
 
 # With a Bayesian neural network as the paper has it: what `model=` and the paper's algorithms change.
 NETWORKS: dict[str, Config] = {
@@ -205,7 +207,7 @@ def _papers(config: Config, **search: Any) -> Config:
     model, fit = config.model, config.fit
     assert isinstance(config.search, Search)
     if isinstance(model, BNN | Lagrangian):
-        model = replace(model, activation="relu", ensemble_size=model.ensemble_size or 1, kl_weight=1.0)
+        model = replace(model, activation="relu", ensemble_size=several(model), kl_weight=1.0)
     if isinstance(fit, Fit):
         fit = replace(fit, learning_rate=1e-4)
     plain = dict(
@@ -283,8 +285,3 @@ def network(name: str) -> str:
     of = PRESETS[name]
     same = (one for one, config in NETWORKS.items() if (config.task, config.legs) == (of.task, of.legs))
     return name if name in (*FOR_ANY, *NETWORKS) else next(same, name)
-
-
-def own(task: str, legs: int = 2) -> str:
-    """The name of the preset that a task begins with, for a swimmer by the legs that it drives."""
-    return f"{task}_six_legs" if legs == 6 else task

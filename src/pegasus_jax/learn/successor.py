@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import optax
 
-from pegasus_jax.types import RunState
+from pegasus_jax.types import Array, RunState
 
 
 def after_episode(state: RunState) -> RunState:
@@ -24,3 +24,8 @@ def after_episode(state: RunState) -> RunState:
         working=optax.tree.where(works, params, state.working),
         working_trial=jnp.where(works, state.policy_trial, 0),
     )
+
+
+def came_back(state: RunState) -> Array:
+    """Whether the policy is one that worked and came back [], so that none is remembered beside it."""
+    return state.succeeded & (state.policy_trial > 0) & (state.working_trial == 0)
