@@ -191,6 +191,8 @@ def test_readings_that_follow_from_others_are_named() -> None:
     assert height.startswith("x2 follows from sin(x0) in")
     (still,) = check.alike(np.column_stack([a, np.full(20, 1e4), np.zeros(20)]))
     assert "the same: x1, x2;" in still
+    (many,) = check.alike(np.zeros((20, 78)))
+    assert "the same: x0, x1, x2, x3, x4, x5, x6, x7 and 70 more;" in many
 
 
 @pytest.mark.parametrize(

@@ -219,6 +219,15 @@ def test_a_warning_says_what_is_unusual_and_nothing_else(run: Path, last: dict[s
     assert bool(found) == bool(says)
 
 
+def test_an_early_end_that_is_not_imagined_is_explained(run: Path) -> None:
+    """With stop= there is nothing to explain."""
+    healthy = look(run)
+    ended = healthy._replace(rows=[{**one, "ended": "terminated"} for one in healthy.rows])
+    told = ended._replace(config=replace(ended.config, stop="robot:hit"))
+    (means,), (less,) = ([one.means for one in findings(found) if "terminated" in one.what] for found in (ended, told))
+    assert means == f"{less} Imagined episodes do not end there: stop= says where."
+
+
 def test_damaged_files_are_named_and_the_rest_is_shown(run: Path, tmp_path: Path) -> None:
     copy = shutil.copytree(run, tmp_path / "run")
     (copy / "imagined" / "0002.npz").write_bytes(b"no array")

@@ -8,7 +8,7 @@ import pytest
 from pegasus_jax.config import Config
 from pegasus_jax.runs import train, writers
 from pegasus_jax.runs.logged import NONE
-from pegasus_jax.runs.stuck import stuck
+from pegasus_jax.runs.stuck import stuck, unforeseen
 
 FIRST: dict[str, Any] = {
     "trial": 4,
@@ -53,17 +53,22 @@ def test_nothing_is_said_of_a_first_trial_or_of_several_seeds() -> None:
     assert stuck([FIRST, FIRST], [SECOND, SECOND]) == []
 
 
-def test_a_run_says_it_once_for_each_two_trials(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = iter([FIRST | {"trial": 1, "random": True}, *(FIRST | {"trial": trial} for trial in (2, 3, 4))])
-    monkeypatch.setattr(train, "one_trial", lambda job, states, trial: (states, lambda: [next(rows)]))
-    said: list[str] = []
+def told(monkeypatch: pytest.MonkeyPatch, rows: list[dict[str, Any]], task: Any) -> list[str]:
+    """What a run with these rows prints, the beginning of each line."""
+    left, said = iter(rows), list[str]()
+    monkeypatch.setattr(train, "one_trial", lambda job, states, trial: (states, lambda: [next(left)]))
     shown = {"phase": lambda *told: None, "trial": lambda rows: said.append(f"trial {rows[0]['trial']}")}
     display = SimpleNamespace(line=said.append, **shown)
-    given = dict(writer=writers.nothing(1), config=Config(trials=4), display=display, logs=NONE, cost_since=[1])
-    experiment = SimpleNamespace(task=SimpleNamespace(environment=None))
-    job = SimpleNamespace(program=SimpleNamespace(concurrent=True), experiment=experiment, **given)
+    given = dict(writer=writers.nothing(1), display=display, logs=NONE, cost_since=[1])
+    settings = dict(program=SimpleNamespace(concurrent=True), experiment=SimpleNamespace(task=task))
+    job = SimpleNamespace(config=Config(trials=len(rows)), **settings, **given)
     train.learn(cast(Any, job), cast(Any, None))
-    assert [line[:55] for line in said] == [
+    return [line[:55] for line in said]
+
+
+def test_a_run_says_it_once_for_each_two_trials(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = [FIRST | {"trial": 1, "random": True}, *(FIRST | {"trial": trial} for trial in (2, 3, 4))]
+    assert told(monkeypatch, rows, SimpleNamespace(environment=None)) == [
         "trial 1",
         "trial 2",
         "trial 3",
@@ -71,3 +76,18 @@ def test_a_run_says_it_once_for_each_two_trials(monkeypatch: pytest.MonkeyPatch)
         "trial 4",
         "note: the controls stayed at a limit in trials 3 and 4,",
     ]
+
+
+def test_an_end_that_nobody_imagines_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of two episodes that the plant ends early the first; not with stop=, of several seeds, or at the horizon."""
+    early = FIRST | {"ended": "terminated", "steps": 12, "saturated": 0.1}
+    task = SimpleNamespace(stop=None, horizon=40, environment=None)
+    (line,) = unforeseen([early], cast(Any, task))
+    assert line.startswith("note: the episode of trial 4 was over after 12 of 40 periods; imagined ones do not end")
+    assert not unforeseen([early], cast(Any, SimpleNamespace(stop=lambda x: x, horizon=40)))
+    assert not unforeseen([early], cast(Any, SimpleNamespace(stop=None, horizon=12)))
+    assert not unforeseen([early, early], cast(Any, task))
+    assert not unforeseen([early | {"ended": "truncated"}], cast(Any, task))
+    (first,) = unforeseen([early | {"trial": 1}], cast(Any, task))
+    rows = [early | {"trial": trial} for trial in (1, 2)]
+    assert told(monkeypatch, rows, task) == ["trial 1", first[:55], "trial 2"]

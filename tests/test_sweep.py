@@ -102,7 +102,7 @@ def beyond(x: Any) -> Any:
         (["seed=0-999", "trials=1-999"], "999,000 combinations; a sweep has at most 10,000"),
         (["seeds=99999999999999999999"], "the nearest is 10000"),
         (["search.grad_clip=1,x"], "search.grad_clip=x is not a number"),
-        (["search.particles=3,100"], "search.particles=3 is too few"),
+        (["search.particles=3,100"], "the nearest is search.particles=5"),
         (["search.grad_clip=1", "clipp=2"], "clipp is not a setting"),
         (["seeds=1,2"], "seeds=1,2 is not a whole number"),
         (["seeds=4", "mesh=3x1"], "mesh=3x1 cannot share 4 seeds evenly; mesh=1x1"),

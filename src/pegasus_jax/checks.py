@@ -4,7 +4,7 @@ import dataclasses
 import difflib
 import math
 import numbers
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from functools import partial, wraps
 from pathlib import PureWindowsPath
@@ -211,6 +211,7 @@ def _meant(value: Any) -> Any:
     return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
+NAMED = 8  # of many, in one line
 PLACES = ("angles", "rates", "circles")  # settings that say which entries of an observation are something
 EXAMPLES: dict[Any, Any] = {  # of settings that are empty by default
     tuple[int, ...]: (0,),
@@ -256,6 +257,12 @@ def shown(value: Any) -> str:
             return shown(value.func if isinstance(value, partial) else type(value))
     words = f"{value:g}" if isinstance(value, float) else str(value)
     return words if words.isprintable() else repr(words)
+
+
+def some(names: Sequence[Any]) -> str:
+    """The first of many names, and how many more there are; pandas gives a column of row numbers none."""
+    more = f" and {len(names) - NAMED} more" if len(names) > NAMED else ""
+    return ", ".join(str(name) or "(no name)" for name in names[:NAMED]) + more
 
 
 def kind(section: str, value: str, kind: str) -> None:

@@ -91,7 +91,8 @@ def search_of(
     if (matches or search.standardized_noise) and search.particles <= states:
         what = "moment matching" if matches else "standardized noise"
         raise ConfigError(
-            f"search.particles={search.particles} is too few: {what} of {states} dimensions needs at least {states + 1}"
+            f"search.particles={search.particles} is too few: {what} of {states} dimensions needs more particles than"
+            f" dimensions; the nearest is search.particles={states + 1}"
         )
     blocks = blocks_of(
         search.particles, task, dynamics, policy, standardized_noise=search.standardized_noise, spread=spread

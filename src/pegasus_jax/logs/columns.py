@@ -6,12 +6,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pegasus_jax.checks import ConfigError, did_you_mean, shown
+from pegasus_jax.checks import ConfigError, did_you_mean, shown, some
 from pegasus_jax.logs import times, units
 from pegasus_jax.logs.table import EPISODE, TIMES, Names, Table, loose, plain
 
 SETTING = "data_columns"
-SHOWN = 8  # names of columns in a note
 
 
 class Column(NamedTuple):
@@ -181,13 +180,6 @@ def untimed(table: Table, where: Layout, names: Names, dt: float) -> str:
     if (found := times.alike(table, unused, dt)) is None:
         return note
     return f"{note}; if {some(found[:1])} is the time, {word({**said, 't': Column(*found)}, names)}"
-
-
-def some(names: Sequence[str]) -> str:
-    """The first of many names, and how many more there are; pandas gives a column of row numbers none."""
-    return ", ".join(name or "(no name)" for name in names[:SHOWN]) + (
-        f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
-    )
 
 
 def matched(columns: Sequence[str], names: Sequence[str]) -> dict[str, str]:

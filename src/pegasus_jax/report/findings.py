@@ -8,6 +8,7 @@ from html import escape
 from importlib import metadata
 from typing import Any, NamedTuple
 
+from pegasus_jax.checks import some
 from pegasus_jax.config_models import BNN, Lagrangian, several
 from pegasus_jax.report.read import Look, coverage, model_of
 from pegasus_jax.runs.store import cost_since
@@ -128,7 +129,8 @@ def _episodes(found: Look) -> Iterator[Finding]:
     meaning: dict[str, tuple[str, str]] = {
         "terminated": (
             "note",
-            "The plant says that an episode is over, for example after a fall. The rest is charged.",
+            "The plant says that an episode is over, for example after a fall. The rest is charged."
+            + (" Imagined episodes do not end there: stop= says where." if found.config.stop is None else ""),
         ),
         "truncated": ("note", "The environment's own time limit came before the horizon."),
         "error": ("warning", "The environment raised an error. The rows until then are data."),
@@ -142,8 +144,7 @@ def _episodes(found: Look) -> Iterator[Finding]:
 
 
 def _listed(trials: list[Any]) -> str:
-    shown = ", ".join(map(str, trials[:8])) + (f" and {len(trials) - 8} more" if len(trials) > 8 else "")
-    return f"trial{'s' if len(trials) > 1 else ''} {shown}"
+    return f"trial{'s' if len(trials) > 1 else ''} {some(trials)}"
 
 
 def said(every: list[Finding]) -> str:

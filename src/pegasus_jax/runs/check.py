@@ -10,7 +10,7 @@ from jax.sharding import Mesh
 from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.assembly.schedules import at_starts, width_of
-from pegasus_jax.checks import ConfigError, shown
+from pegasus_jax.checks import ConfigError, shown, some
 from pegasus_jax.config import Config, Search, first_search
 from pegasus_jax.imagine import costs
 from pegasus_jax.logs.read import Logged
@@ -188,7 +188,7 @@ def alike(readings: np.ndarray, angles: tuple[int, ...] = (), names: tuple[str, 
     still = spread <= 1e-6 * np.maximum(1, np.abs(readings).max(0))
     notes = []
     if still.any():
-        same = ", ".join(names[i] for i in np.flatnonzero(still))
+        same = some([names[i] for i in np.flatnonzero(still)])
         notes.append(
             f"after each of {count} resets the same: {same}; right for a rate at rest, else a sensor may be dead"
         )

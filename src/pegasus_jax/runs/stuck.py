@@ -1,7 +1,9 @@
-"""What a person is told of a policy with a control that stays at a limit: without help so it goes on."""
+"""What a person is told of a run that goes on so without help: a control at its limit, ends that nobody imagines."""
 
 from collections.abc import Sequence
 from typing import Any
+
+from pegasus_jax.task import Task
 
 AT_LIMITS = 0.95  # of the periods of an episode
 FAILED = 0.5  # an episode that costs more on average: where full controls are right, as in a race, the cost is small
@@ -35,3 +37,12 @@ def stuck(before: Sequence[dict[str, Any]], now: Sequence[dict[str, Any]]) -> li
     trials = f"trials {first['trial']} and {second['trial']}"
     who = "the controls" if len(pushing) == len(each[1]) else ", ".join(pushing)
     return [f"note: {who} stayed at a limit in {trials}, and the episodes failed (cost {cost:.2f}); {why}"]
+
+
+def unforeseen(now: Sequence[dict[str, Any]], task: Task) -> list[str]:
+    """A line where the plant ended the one seed's episode early, and imagined episodes go on: no `stop` was given."""
+    ended = [row for row in now if row.get("ended") == "terminated"]
+    if len(now) != 1 or not ended or task.stop is not None or ended[0]["steps"] >= task.horizon:
+        return []
+    when = f"the episode of trial {ended[0]['trial']} was over after {ended[0]['steps']} of {task.horizon} periods"
+    return [f"note: {when}; imagined ones do not end there, unless stop=module:function says where (docs/simulator.md)"]

@@ -28,7 +28,7 @@ from pegasus_jax.runs.display import learned
 from pegasus_jax.runs.evaluation import UNMEASURED, evaluate, kept_to, saturated
 from pegasus_jax.runs.job import Job, first_states, opened
 from pegasus_jax.runs.programs import Program, gather, is_main_process, quick
-from pegasus_jax.runs.stuck import stuck
+from pegasus_jax.runs.stuck import stuck, unforeseen
 from pegasus_jax.runs.writers import Row, part
 from pegasus_jax.task import Task
 from pegasus_jax.types import RunState, Trajectory
@@ -131,13 +131,16 @@ def learn(job: Job, states: RunState, done: int | None = None) -> RunState:
         if done is None:
             job.writer.ready(states)
     before: list[Row] = []
+    told: list[str] = []  # once
     changed = [{"cost_since": since} if since > 1 else {} for since in job.cost_since or [1] * len(job.seeds)]
 
     def kept(trial: int, states: RunState, result: Result) -> None:
         rows = [row | since for row, since in zip(result(), changed, strict=True)]
         job.writer.trial(trial, states, rows)
         job.display.trial(rows)
-        for line in stuck(before, rows):
+        news = [] if told else unforeseen(rows, job.experiment.task)
+        told.extend(news)
+        for line in [*stuck(before, rows), *news]:
             job.display.line(line)
         before[:] = [] if "logs" in rows[0] else rows
 
