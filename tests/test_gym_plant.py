@@ -368,6 +368,15 @@ def test_a_control_period_that_nobody_said_or_two_did_is_noted(about: dict, dt: 
     close_environments()
 
 
+@pytest.mark.parametrize(
+    ("task", "said", "own", "told"),
+    [("gym", None, 1000, True), ("gym", None, 100, False), ("gym", 1000, 1000, False), ("cartpole", None, 1000, False)],
+)
+def test_a_horizon_that_nobody_said_and_is_long_is_noted(task: str, said: int | None, own: int, told: bool) -> None:
+    notes = assumed.length(Config(task=task, env="Long-v0", horizon=said), cart()._replace(horizon=own))
+    assert [note.startswith("an episode has the environment's own 1000 periods") for note in notes] == [True] * told
+
+
 @pytest.mark.parametrize(("task", "episodes", "count"), [("gym", 20, 1), ("gym", 0, 0), ("cartpole", 20, 0)])
 def test_episodes_that_only_measure_are_noted_where_a_robot_may_run_them(task: str, episodes: int, count: int) -> None:
     gymnasium.register("Measured-v0", Base)

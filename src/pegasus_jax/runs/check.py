@@ -115,6 +115,7 @@ def unsaid(given: Config, known: Config, task: Task) -> list[str]:
     """Notes on what the user did not say of an environment, and what is taken for it; `known` is what is."""
     return (
         assumed.notes(given)
+        + assumed.length(given, task)
         + assumed.rotations(given, task)
         + circles_found(given, known)
         + assumed.networks(given.model, len(task.state_names))

@@ -8,6 +8,8 @@ from pegasus_jax.config import GYM, MJCF, Config
 from pegasus_jax.config_models import Model, several, sized
 from pegasus_jax.task import Task
 
+MANY = 100  # control periods of an episode
+
 
 def notes(given: Config) -> list[str]:
     """Notes on a config as it was `given`, whose environment is open: its period, and its episodes that only measure.
@@ -28,6 +30,16 @@ def notes(given: Config) -> list[str]:
             " and are not learned from; eval_episodes=0 leaves them out"
         )
     return told
+
+
+def length(given: Config, task: Task) -> list[str]:
+    """The note that an episode has as many control periods as the environment's own limit, where these are many."""
+    if given.task != GYM or given.horizon is not None or task.horizon <= MANY:
+        return []
+    return [
+        f"an episode has the environment's own {task.horizon} periods, and each iteration of a search goes through all"
+        f" of them; horizon={MANY} makes it shorter, and docs/simulator.md holds each control for several steps"
+    ]
 
 
 def rotations(given: Config, task: Task) -> list[str]:
