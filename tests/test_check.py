@@ -221,6 +221,12 @@ def test_where_episodes_end_is_looked_at_before_they_begin(stop: Any, says: str 
             (),
             ["heading [rad] is not among angles=; if it can turn around, angles=[0]"],
         ),
+        (
+            ("hip [rad]", "knee [rad]"),
+            (),
+            ["hip [rad], knee [rad] are not among angles=; if they can turn around, angles=[0,1]"],
+        ),
+        (("hip [rad]", "knee [rad]"), (1,), ["hip [rad] is not among angles=; if it can turn around, angles=[0,1]"]),
         (("y [m]", "x1"), (0,), ["angles=[0]: y [m] is said to be an angle, and its unit is not rad"]),
         (("x0", "x1"), (0,), []),
     ],

@@ -151,14 +151,17 @@ def stopping(config: Config, task: Task) -> None:
 def turning(facts: cost_check.Facts, names: tuple[str, ...]) -> list[str]:
     """Notes on entries whose unit is an angle's and that are not said to be angles, and the other way round."""
     places = entries(len(facts.start_mean) + len(facts.circles), facts.circles)
+    units = [parted(name)[1] for name in names]
+    free = [i for i, unit in enumerate(units) if unit == "rad" and i not in facts.angles]
     notes = []
-    for entry, name in enumerate(names):
-        _, unit = parted(name)
-        if unit == "rad" and entry not in facts.angles:
-            notes.append(f"{name} is not among angles=; if it can turn around, angles=[{places[entry]}]")
-        elif unit not in (None, "rad") and entry in facts.angles:
-            notes.append(f"angles=[{places[entry]}]: {name} is said to be an angle, and its unit is not rad")
-    return notes
+    if free:
+        which = some([names[i] for i in free])
+        said = {places[i] for i in facts.angles} - {min(pair) for pair in facts.circles}
+        angles = shown(sorted(said | {places[i] for i in free}))
+        if_so = "is not among angles=; if it can turn" if len(free) == 1 else "are not among angles=; if they can turn"
+        notes.append(f"{which} {if_so} around, angles={angles}")
+    wrong = [i for i in facts.angles if units[i] not in (None, "rad")]
+    return notes + [f"angles=[{places[i]}]: {names[i]} is said to be an angle, and its unit is not rad" for i in wrong]
 
 
 def plausible(readings: np.ndarray, facts: cost_check.Facts, names: tuple[str, ...]) -> list[str]:
