@@ -322,7 +322,7 @@ def test_eval_and_plot_work_while_a_run_goes_on(whole: Path, tmp_path: Path) -> 
         ("train", ["task=cartpole", "serch.steps=3"], "did you mean 'search.steps'"),
         ("train", ["task=cartpole", "search.steps=many"], "a whole number"),
         ("train", ["task=cartpole", "policy.dropout=1.5"], "the nearest is 0.99"),
-        ("train", ["task=cartpole", "search.particles=4"], "at least 5"),
+        ("train", ["task=cartpole", "search.particles=4"], "the nearest is search.particles=5"),
         ("train", ["task=cartpole", "out=/proc/nowhere"], "out=/proc/nowhere cannot be written"),
         ("train", ["resume=nowhere"], "nowhere is not a run"),
         ("train", ["resume=nowhere", "seed=3"], "seed cannot be changed"),
