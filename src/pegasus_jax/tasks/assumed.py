@@ -38,7 +38,7 @@ def length(given: Config, task: Task) -> list[str]:
         return []
     return [
         f"an episode has the environment's own {task.horizon} periods, and each iteration of a search goes through all"
-        f" of them; horizon={MANY} makes it shorter, and docs/simulator.md holds each control for several steps"
+        f" of them; horizon={MANY} makes it shorter, and docs/simulator.md shows how to hold a control for some steps"
     ]
 
 
