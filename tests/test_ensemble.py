@@ -5,12 +5,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pegasus_jax import tasks
 from pegasus_jax.assembly.pieces import dynamics_of, policy_of
 from pegasus_jax.assembly.searchers import blocks_of
-from pegasus_jax.config import BNN, GP, MLP, Lagrangian, model_word
+from pegasus_jax.config import BNN, GP, MLP, Config, Lagrangian, model_word
 from pegasus_jax.config_models import sized
 from pegasus_jax.imagine.scenarios import draw
 from pegasus_jax.models.ensemble import ensemble
+from pegasus_jax.runs import config_io, writers
 from pegasus_jax.tasks import assumed
 from pegasus_jax.types import Batch, Dataset, Period, Prediction
 from pegasus_jax.vectorized import for_particles
@@ -134,18 +136,18 @@ def test_members_see_different_rows(pair):
     assert any(not np.allclose(leaf[0], leaf[1]) for leaf in jax.tree.leaves(gradient))
 
 
-@pytest.mark.parametrize("states", [1, 4, 6, 7, 13, 40])
-def test_a_plant_of_more_than_six_states_has_five_networks_and_their_whole_divergence(states):
+@pytest.mark.parametrize(("states", "size"), [(1, 1), (4, 1), (6, 1), (7, 5), (10, 5), (11, 20), (13, 20), (40, 20)])
+def test_a_plant_of_more_states_has_more_networks_and_their_whole_divergence(states, size):
     """What is said stays, and null becomes a number of the plant's size alone: docs/decisions.md 0017."""
     chosen = sized(BNN(ensemble_size=None, kl_weight=None), states)
-    assert (chosen.ensemble_size, chosen.kl_weight) == ((5, 1.0) if states > 6 else (1, 0.1))
+    assert (chosen.ensemble_size, chosen.kl_weight) == (size, 1.0 if size > 1 else 0.1)
     assert sized(BNN(ensemble_size=2, kl_weight=None), states).kl_weight == 1.0
     assert sized(BNN(ensemble_size=None, kl_weight=0.3), states).kl_weight == 0.3
     for said in (BNN(), BNN(ensemble_size=7, kl_weight=0.0), Lagrangian(ensemble_size=5)):
         assert sized(said, states) == said
 
 
-@pytest.mark.parametrize(("states", "size"), [(6, 1), (7, 5)])
+@pytest.mark.parametrize(("states", "size"), [(6, 1), (7, 5), (11, 20)])
 def test_the_model_of_a_task_has_as_many_networks_as_its_states_ask_for(states, size):
     task = cart()._replace(state_names=tuple(f"x{i}" for i in range(states)))
     by_states, said = (
@@ -153,6 +155,14 @@ def test_the_model_of_a_task_has_as_many_networks_as_its_states_ask_for(states, 
         for config in (BNN(hidden=(8,), ensemble_size=None), BNN(hidden=(8,), ensemble_size=size))
     )
     assert jax.tree.map(jnp.shape, by_states) == jax.tree.map(jnp.shape, said)
+
+
+def test_a_run_keeps_the_numbers_that_it_began_with(tmp_path):
+    """Its folder holds them, so that it goes on where a later version chooses others for null."""
+    config = Config(task="swimmer_knife_edge", model=BNN(ensemble_size=None, kl_weight=None))
+    writers.run_folders({3: tmp_path}, config, tasks.make(config.task), "pegasus-train").begin(0)
+    kept = config_io.load(tmp_path / "config.yaml")
+    assert (kept.seed, kept.model) == (3, BNN(ensemble_size=5, kl_weight=1.0))
 
 
 def test_a_run_says_that_its_states_ask_for_five_networks():

@@ -264,6 +264,21 @@ def test_a_policy_that_sees_something_else_is_no_beginning(tmp_path):
         assert len({*memory.seen_kinds(task)}) == len(memory.seen_names(task))
 
 
+def test_a_model_of_a_number_that_nobody_said_begins_with_one_of_that_number(tmp_path):
+    null = {"model.ensemble_size": "null", "model.kl_weight": "null"} | NETWORK
+    old = a_run(tmp_path / "old", trials=1, **null)
+    number = null | {"model.ensemble_size": "1", "model.kl_weight": "0.1"}
+
+    def notes(words):
+        config = parse(init=str(old), init_parts="[model]", **words)
+        return begin.checked(config, tasks.of_config(config))
+
+    for words in (null, number):
+        assert "begins with the model of trial 1" in notes(words)[0]
+    with pytest.raises(ConfigError, match=r"has model.ensemble_size=1, and this run 2; model.ensemble_size=1"):
+        notes(number | {"model.ensemble_size": "2"})
+
+
 def said(words):
     config = config_io.parse(words)
     return begin.checked(config, tasks.of_config(config))

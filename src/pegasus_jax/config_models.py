@@ -24,7 +24,7 @@ class _Network:
 
     kind: str = setting("", "")
     ensemble_size: int | None = setting(
-        1, "models fitted side by side, each particle follows one; null: five for more than six states, else one"
+        1, "models fitted side by side, each particle follows one; null: 1 up to six states, 5 up to ten, else 20"
     )
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
@@ -103,9 +103,14 @@ def sized(model: Model, states: int) -> Model:
     """A model's settings for a plant of so many states, with a number for each null: docs/decisions.md 0017."""
     if isinstance(model, GP | SSGP):
         return model
-    size = model.ensemble_size or (5 if states > 6 else 1)
+    size = model.ensemble_size or networks(states)
     own = 1.0 if size > 1 else 0.1
     return replace(model, ensemble_size=size, kl_weight=own if model.kl_weight is None else model.kl_weight)
+
+
+def networks(states: int) -> int:
+    """How many networks a plant of so many states needs, so that a policy cannot learn the errors of all of them."""
+    return 1 if states <= 6 else 5 if states <= 10 else 20
 
 
 def several(model: Model) -> int:
