@@ -62,7 +62,7 @@ def networks(model: Model, states: int) -> list[str]:
     if size == several(model):
         return []
     said = f"{states} states: the model is {size} networks, and each imagined episode follows one of them"
-    return [f"{said}; model.ensemble_size=1 takes one alone, which is often too sure of itself"]
+    return [f"{said}; model.ensemble_size=1 takes one alone, which is quicker and often too sure of itself"]
 
 
 def period(given: Config) -> list[str]:
