@@ -6,7 +6,6 @@ first.py copies the run of explore.policy= in the same way.
 """
 
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,6 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError, RunError, shown
 from pegasus_jax.config import Config, begins_with
-from pegasus_jax.config_models import sized
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.memory import seen_kinds, seen_names
 from pegasus_jax.runs import checkpoint, config_io, logged, restore, store
@@ -68,7 +66,7 @@ def checked(config: Config, task: Task) -> list[str]:
             " previous_u, t, reference and goal"
         )
         raise ConfigError(f"{what} has a policy that sees {its}, and here it would see {mine}{why}")
-    both = [replace(one, model=sized(one.model, len(task.state_names))) for one in (old, config)]
+    both = [config_io.numbered(one, len(task.state_names)) for one in (old, config)]
     for part in learned:  # data are checked as logs are
         its, mine = (config_io.leaves(getattr(one, part), f"{part}.") for one in both)
         for name in its:

@@ -12,6 +12,7 @@ from yaml import YAMLError
 
 from pegasus_jax.checks import FUNCTION, ConfigError, did_you_mean, expected, shown
 from pegasus_jax.config import KINDS, TASKS, Config, check_spread, uses
+from pegasus_jax.config_models import sized
 from pegasus_jax.config_used import check_used, leaves
 from pegasus_jax.presets import FOR_ANY, WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
@@ -150,6 +151,13 @@ def described(node: Any, prefix: str = "") -> dict[str, tuple[str, str]]:
         elif name not in NAMED and f.metadata["help"]:
             found[name] = (f"{name}={shown(value)}", f.metadata["help"])
     return found
+
+
+def numbered(config: Config, states: int) -> Config:
+    """The config of a plant of so many states, with a number for each null of its model: a later version may choose
+    other numbers, and a run goes on with those that it began with.
+    """
+    return dataclasses.replace(config, model=sized(config.model, states))
 
 
 def save(config: Config, path: Path) -> None:

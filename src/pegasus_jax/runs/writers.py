@@ -14,7 +14,6 @@ import jax
 
 from pegasus_jax.checks import RunError
 from pegasus_jax.config import Config
-from pegasus_jax.config_models import sized
 from pegasus_jax.episode import Episode
 from pegasus_jax.experiment import Successor
 from pegasus_jax.runs import checkpoint, config_io, store
@@ -60,12 +59,11 @@ def run_folders(runs: dict[int, Path], config: Config, task: Task, command: str)
     Called by who holds the folders' locks. `command` is what the user typed.
     """
     folders = list(runs.values())
-    # A later version may choose other numbers for what is null, and this run goes on with those that it began with.
-    said = replace(config, model=sized(config.model, len(task.state_names)))
+    known = config_io.numbered(config, len(task.state_names))
 
     def begin(done: int) -> None:
         for seed, run in runs.items() if is_main_process() else ():
-            config_io.save(replace(said, seed=seed), run / "config.yaml")
+            config_io.save(replace(known, seed=seed), run / "config.yaml")
             store.note(run, command, done, task)
             store.write_trials(run, store.readable_trials(run)[0][:done])
 
