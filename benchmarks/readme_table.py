@@ -13,7 +13,7 @@ import numpy as np
 
 from benchmarks import own_cost, study
 from benchmarks.paper import claims
-from benchmarks.paper.comparison import Result
+from benchmarks.paper.comparison import Result, measured, numbered
 from benchmarks.paper.comparison import stored as read
 from pegasus_jax.config import MANEUVERS
 from pegasus_jax.presets import PRESETS, own
@@ -86,8 +86,7 @@ def pooled(row: Row, out: Path) -> Result:
 
 def changes(row: Row, result: Result) -> str:
     """The words that make the stored config of the row's preset; "" where it is the preset."""
-    own = config_io.leaves(PRESETS[row.preset])
-    made = config_io.leaves(config_io.stored_config(result["config"]))
+    own, made = config_io.leaves(numbered(PRESETS[row.preset])), config_io.leaves(measured(result))
     return " ".join(f"{key}={word(made[key])}" for key in made if key not in FREE and made[key] != own.get(key))
 
 

@@ -21,7 +21,7 @@ import pytest
 
 import benchmarks
 from benchmarks import RESULTS, pictures, readme_table, results_page, searches, study
-from benchmarks.paper import figures
+from benchmarks.paper import comparison, figures
 from benchmarks.plants_suite import batched
 from benchmarks.robot import costs
 from benchmarks.speed import compare, scaling, timing
@@ -295,9 +295,9 @@ def test_a_row_is_its_preset_with_the_settings_that_the_row_says(row):
     for stem in row.studies:
         result = json.loads((RESULTS / f"{stem}.json").read_text())
         words = shlex.split(f"preset={row.preset} {readme_table.changes(row, result)}")
-        label, made = config_io.parse(config_io.split(words)[1]), config_io.stored_config(result["config"])
+        label, made = config_io.parse(config_io.split(words)[1]), comparison.measured(result)
         free = {name: getattr(made, name) for name in readme_table.FREE}
-        assert made == dataclasses.replace(label, **free)
+        assert made == comparison.numbered(dataclasses.replace(label, **free))
 
 
 def test_readme_reports_what_the_first_commands_learn_with():

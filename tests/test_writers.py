@@ -1,5 +1,6 @@
 """One loop, several writers: what is learned does not depend on where it is written."""
 
+import dataclasses
 from collections.abc import Callable
 from threading import Event
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import RunError
+from pegasus_jax.config import BNN
 from pegasus_jax.episode import Episode
 from pegasus_jax.experiment import run
 from pegasus_jax.runs import checkpoint, store, writers
@@ -18,7 +20,7 @@ from pegasus_jax.runs.beside import beside
 from pegasus_jax.runs.display import Display
 from pegasus_jax.runs.job import Job, first_states
 from pegasus_jax.runs.programs import Program
-from pegasus_jax.runs.study import one_json, rounded
+from pegasus_jax.runs.study import curves, one_json, rounded
 from pegasus_jax.runs.train import learn
 from pegasus_jax.runs.writers import Writer
 from pegasus_jax.types import RunState, Trajectory
@@ -75,6 +77,14 @@ def test_a_study_keeps_the_rows_of_the_folders(job: Job, unwritten: RunState, tm
     assert handed[-1]["seeds"] == SEEDS
     assert handed[-1]["config"]["search.steps"] == 10
     assert handed[-1]["calibration"][0][0] is None  # there was no model before the first trial
+
+
+def test_a_study_keeps_the_number_of_networks_that_it_was_made_with() -> None:
+    """A later version may choose another number for null."""
+    config = dataclasses.replace(CONFIG, model=BNN(ensemble_size=None, kl_weight=None))
+    eight = cart()._replace(state_names=tuple("abcdefgh"))
+    kept = curves(config, SEEDS, [], eight)["config"]
+    assert (kept["model.ensemble_size"], kept["model.kl_weight"]) == (5, 1.0)
 
 
 def test_the_loop_learns_what_the_whole_run_as_one_program_learns(job: Job, unwritten: RunState) -> None:

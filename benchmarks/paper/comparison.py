@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from benchmarks.paper.figures import Figure
+from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError, RunError, did_you_mean
 from pegasus_jax.config import Config
@@ -98,13 +99,24 @@ def draw(figure: Figure, there: dict[str, Result], out: Path) -> Path:
     return path
 
 
+def measured(result: Result) -> Config:
+    """The config of a stored study, with the numbers of its model."""
+    return numbered(config_io.stored_config(result["config"]))
+
+
+def numbered(config: Config) -> Config:
+    """The config with what null is on its plant: a study has the numbers that it was made with."""
+    return config_io.numbered(config, len(tasks.of_config(config).state_names))
+
+
 def differences(figure: Figure, there: dict[str, Result], seeds: str = "", changes: Sequence[str] = ()) -> list[str]:
     """A line for each study that was made with other seeds or settings than the figure now asks for."""
     lines, chosen = [], seed_list(seeds or figure.seeds)
     for label, config in configs(figure, changes).items():
-        asked = {key: value for key, value in config_io.plain(config).items() if key != "seed"}
-        had = there[label]["config"] if label in there else {}
-        other = [f"{key}={had[key]}, not {value}" for key, value in asked.items() if key in had and had[key] != value]
+        asked = {key: value for key, value in config_io.plain(numbered(config)).items() if key != "seed"}
+        kept = there[label]["config"] if label in there else {}  # of an older version, without younger settings
+        had = config_io.plain(measured(there[label])) if kept else {}
+        other = [f"{key}={had[key]}, not {value}" for key, value in asked.items() if key in kept and had[key] != value]
         if label in there and there[label]["seeds"] != chosen:
             other.append(f"seeds={there[label]['seeds']}, not {chosen}")
         if other:

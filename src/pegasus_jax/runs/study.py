@@ -81,7 +81,7 @@ def curves(config: Config, seeds: list[int], trials: list[list[Row]], task: Task
         **{name: rounded(of(name)) for name in ROUNDED},
         "success_rate": of("success_rate"),
         "skipped_updates": of("skipped_updates"),
-        "config": config_io.plain(config),
+        "config": config_io.plain(config_io.numbered(config, len(task.state_names))),
     }
 
 
