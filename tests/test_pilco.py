@@ -9,6 +9,7 @@ import optax
 import pytest
 from scipy.optimize import minimize
 
+from pegasus_jax import build, preset
 from pegasus_jax.imagine import costs
 from pegasus_jax.imagine.rollout import NoiseUse
 from pegasus_jax.math import angles, gaussian
@@ -29,6 +30,17 @@ STD = np.array([0.02, 0.05, 0.01])  # the model's observation noise
 def x64():
     with jax.enable_x64(True):
         yield
+
+
+def test_an_experiment_has_the_precision_of_who_runs_it():
+    """A command builds it to look at its task, and Python's `train` may be given a config that was built before."""
+    words = {"search.steps": 3, "fit.steps": 3}
+    with jax.enable_x64(False):
+        experiment = build(preset("cartpole", model="ssgp", policy="rbf", algorithm="pilco", settings=words))
+    state = jax.eval_shape(experiment.init, jax.random.key(0))
+    found, info = jax.eval_shape(experiment.search, state)
+    assert {leaf.dtype for leaf in jax.tree.leaves(found.policy.params)} == {np.dtype(np.float64)}
+    assert info.objective.dtype == np.float64
 
 
 # A Gaussian process of changes over (features, control), and an RBF controller, both from a few random points

@@ -199,10 +199,11 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
 
     Impossible settings and logs end here, before anything is written.
     """
-    from pegasus_jax.assembly.experiments import build
+    from pegasus_jax.assembly.experiments import build, set_precision
     from pegasus_jax.runs import check, first, restore
     from pegasus_jax.tasks import resolve
 
+    set_precision(asked.config)  # before anything is built
     if asked.resumed is not None:
         config = restore.moved(asked.resumed, asked.config, asked.mjcf)
         restore.announce(asked.resumed, config)

@@ -207,19 +207,21 @@ def analytic_search_of(
         raise ConfigError(
             "algorithm=pilco needs a policy with analytic moments, saturated by sines: policy=rbf, policy=linear"
         )
-    mean, std = jnp.asarray(task.start_mean, float), jnp.asarray(task.start_std, float)
     low, high = limits(task)
     pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy)
 
+    def begin() -> tuple[Array, Array]:  # in the precision of the program, not in that of who builds it
+        return jnp.asarray(task.start_mean, float), jnp.diag(jnp.asarray(task.start_std, float) ** 2)
+
     def noise_std(key: Key, posterior: Params) -> Array:
         middle = (low + high) / 2
-        return dynamics.apply(posterior, dynamics.sample(key, posterior), mean, middle).std
+        return dynamics.apply(posterior, dynamics.sample(key, posterior), begin()[0], middle).std
 
     def value(params: Params, posterior: Params, std: Array) -> Array:
         return pilco.objective(
             params,
             posterior,
-            begin,
+            begin(),
             std,
             **pieces,
             horizon=task.horizon,
@@ -228,7 +230,6 @@ def analytic_search_of(
             noise=noise,
         )
 
-    begin = mean, jnp.diag(std**2)
     blocks = blocks_of(search.particles, task, dynamics, policy)
     imagine = partial(imagined, **pieces, blocks=blocks, task=task, match=matching.keep, noise=noise)
     return Searching(pilco.analytic(value, noise_std, restart=search.init == "better"), imagine)
