@@ -96,13 +96,14 @@ def test_a_traced_program_is_traced_once_and_a_damaged_one_again(tmp_path: Path)
 def test_a_program_belongs_to_its_settings(monkeypatch: pytest.MonkeyPatch) -> None:
     config = preset("cartpole")
 
-    def job(**changes: object) -> str:
-        found = traced.store(replace(config, **changes), 1, alone=True)
+    def job(rows: int = 1024, **changes: object) -> str:
+        found = traced.store(replace(config, **changes), 1, rows, alone=True)
         assert found is not None
         return found.job
 
     own = job()
     assert own == job(seed=3) == job(trials=2)
+    assert own != job(rows=2048)  # no argument of the program that begins a run tells how long it may be
     others = {job(successor="better"), job(horizon=20), job(env_args=("pole_mass=0.4",)), job(x64=True)}
     others.add(job(search=replace(config.search, learning_rate=2e-3)))
     monkeypatch.setattr(traced, "code", lambda: "another version")
@@ -111,6 +112,6 @@ def test_a_program_belongs_to_its_settings(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_what_a_user_wrote_is_traced_each_time() -> None:
     config = preset("cartpole")
-    assert traced.store(replace(config, cost="costs:cost"), 1, alone=True) is None
-    assert traced.store(replace(config, constraint="limits:far"), 1, alone=True) is None
-    assert traced.store(config, 2, alone=False) is None
+    assert traced.store(replace(config, cost="costs:cost"), 1, 1024, alone=True) is None
+    assert traced.store(replace(config, constraint="limits:far"), 1, 1024, alone=True) is None
+    assert traced.store(config, 2, 1024, alone=False) is None

@@ -56,7 +56,8 @@ def opened(
     loaded = first.loaded(config, run)
     experiment = build(replace(loaded, seed=0), mesh, logs.rows)  # the seed is in the key: all share one program
     try:
-        kept = traced.store(config, len(seeds), alone=mesh is None)
+        rows = capacity(config, experiment.task, logs.rows)
+        kept = traced.store(config, len(seeds), rows, alone=mesh is None)
         program = Program(experiment, config.search.steps, len(seeds), mesh, traced=kept)
         display = Display(config.trials, quiet=not is_main_process())
         display.exploring = guide.exploring(config)

@@ -22,7 +22,7 @@ from pegasus_jax.runs import cache as folders
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.files import write_whole
 
-# Settings that no program depends on: what they change of it shows in the shapes of its arguments.
+# Settings that no program depends on, but for the rows that its data have room for.
 FREE = ("seed", "trials", "eval_episodes", "data", "data_columns", "data_control")
 # Settings behind which there is code of a user, a file or another run: nobody knows what else that depends on.
 THEIRS = ("env", "mjcf", "cost", "stop", "goals", "constraint", "reference", "prior", "explore.policy", "init")
@@ -56,15 +56,15 @@ class Store(NamedTuple):
         return self.folder / f"{name}-{hashlib.sha256(told.encode()).hexdigest()}.stablehlo"
 
 
-def store(config: Config, seeds: int, *, alone: bool) -> Store | None:
-    """The store for a config's programs; None where they are traced each time: of a task with code of its user, on a
-    GPU, and where the job is not `alone` on one device.
+def store(config: Config, seeds: int, rows: int, *, alone: bool) -> Store | None:
+    """The store for a config's programs, with room for so many `rows` of data. None where they are traced each time: of
+    a task with code of its user, on a GPU, and where the job is not `alone` on one device.
     """
     settings = {name: value for name, value in config_io.plain(config).items() if name not in FREE}
     if jax.default_backend() != "cpu" or not alone or any(settings[name] is not None for name in THEIRS):
         return None
     flags = {name: value for name, value in jax.config.values.items() if "cache" not in name}
-    told = repr([sorted(settings.items()), seeds, sorted(map(str, flags.items())), jax.device_count(), code()])
+    told = repr([sorted(settings.items()), seeds, rows, sorted(map(str, flags.items())), jax.device_count(), code()])
     return Store(folder(), hashlib.sha256(told.encode()).hexdigest())
 
 
