@@ -116,8 +116,8 @@ class Search:
     anneal_trials: int = setting(1, "trials over which cost_width_start= and decay= run down once; 1: in every search")
     particle_grad_limit: float | None = setting(
         None,
-        "drop a particle's gradient with respect to its state where it is longer; null: with search.visited_starts= where"
-        " the cost would change tenfold its range within the spread of the data, else never",
+        "drop a particle's gradient with respect to its state where it is longer; null: with search.visited_starts="
+        " where the cost would change tenfold its range within the spread of the data, else never",
     )
     warm_restart: float = setting(
         0.0, "after `anneal_trials`: step size at the start of each search, as a fraction; 0: constant"
@@ -127,7 +127,7 @@ class Search:
     init: str = setting(
         "better",
         "what a search starts from: the previous policy; a fresh one; the better of both; or raced, the better of both"
-        " after a quarter of the search before it refines for each",
+        " after a quarter of the search before it refines for each; of search.num_starts= one is the previous",
     )
     num_starts: int = setting(
         1, "policies searched side by side, the best of which goes on: the old one and fresh ones"
