@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from pegasus_jax.checks import ConfigError, did_you_mean
+from pegasus_jax.checks import ConfigError, did_you_mean, whole
 from pegasus_jax.config import BNN, MLP, Analytic, Config, Explore, Fit, Period, Search
 from pegasus_jax.config_models import DROPOUTS
 
@@ -119,6 +119,13 @@ def test_an_impossible_value_is_named_in_one_line(kind, fields, part):
     assert part in message
     assert "\n" not in message
     assert next(iter(fields)) in message
+
+
+def test_a_number_without_end_is_one_line():
+    """Python itself refuses to read thousands of digits, and to make floats of hundreds."""
+    for digits in (25, 400, 5000):
+        with pytest.raises(ConfigError, match=rf"^episodes=10+\.\.\. has {digits} digits; expected a number in \["):
+            whole("episodes", "1" + "0" * (digits - 1))
 
 
 def test_numbers_of_numpy_become_pythons_own():

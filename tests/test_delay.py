@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pegasus_jax import tasks
-from pegasus_jax.checks import ConfigError, RunError
+from pegasus_jax.checks import ConfigError, RunError, whole
 from pegasus_jax.cli.delay import handle
 from pegasus_jax.math.delays import delay_of
 from pegasus_jax.runs import config_io
@@ -120,6 +120,7 @@ def test_where_nothing_answers_it_offers_more_periods_before_larger_controls() -
     assert "; type periods=1600, and if that is not enough amplitude=0.2" in line
     assert "nearest" not in line
     assert "amplitude=" not in told(measured(still, amplitude=1.0, periods=400))
+    assert whole("periods", "20000") == 20000  # what it offers it takes
 
 
 def test_a_delay_that_is_not_sure_is_no_answer() -> None:

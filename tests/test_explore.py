@@ -73,6 +73,12 @@ def test_a_first_controller_is_given_positions_and_their_differences_wherever_th
     assert np.abs(rate).max() > 0.5
 
 
+def test_a_first_controller_drives_a_trial_also_beside_a_simulator():
+    """Which needs no random episode: nothing that was asked for is left out without a word."""
+    assert config_io.parse({"prior": "simulator:step"}).explore.trials == 0
+    assert config_io.parse({"prior": "simulator:step", "explore.policy": "robot:stand"}).explore.trials == 1
+
+
 # explore.policy=RUN
 
 NETWORK = {"preset": "cartpole_network"}  # compiles faster than a mechanism

@@ -324,6 +324,8 @@ def test_unknown_numbers_are_null_and_seeds_are_lists_or_ranges():
     assert seed_list("0-3") == [0, 1, 2, 3]
     assert seed_list("5,2") == [5, 2]
     assert seed_list("7") == [7]
+    with pytest.raises(ConfigError, match=r"names 0 twice; the nearest is \[0,1\]"):  # one curve would count as two
+        seed_list("0,0,1")
     for text in ("9-3", "one", "", "-1", "0-99999999999999999999"):
         with pytest.raises(ConfigError, match="names no seeds"):
             seed_list(text)

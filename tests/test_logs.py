@@ -149,6 +149,17 @@ def test_another_rate_is_resampled_and_controls_are_held(tmp_path):
     assert "controls change within" in " ".join(transitions(CART, written(tmp_path / "a.csv", "t,x,v,u", rows))[1])
 
 
+@pytest.mark.parametrize("step", [0.03, 0.05, 0.07])
+def test_the_last_time_of_a_log_is_inside_it(step, tmp_path):
+    """The end of a period may be later than the last row, by a rounding."""
+    for length in range(14, 70):
+        t = np.arange(length) * step
+        rows = np.column_stack([t, t, 0 * t, 0 * t])
+        (x, _, after), _ = transitions(CART, written(tmp_path / "a.csv", "t,x,v,u", rows))
+        assert np.isfinite(x).all()
+        assert np.isfinite(after).all()
+
+
 @pytest.mark.parametrize("low", [-np.pi, 0])
 def test_an_angle_is_interpolated_over_its_seam(low, tmp_path):
     t = np.arange(0, 6.01, 0.5)
@@ -193,6 +204,7 @@ GOOD = "t,x,v,u\n0,0,0,0\n.3,0,0,0\n"
         ("t,x,speed,u\n0,0,0,0\n", "has no column v, it has t, x, speed, u; data_columns=[...] says"),
         ("t,a,b,c,d\n0,0,0,0,0\n", "has 4 columns, a, b, c, d; expected 3: x, v, u; data_columns=[...]"),
         ("x,v,v\n0,0,0\n", "two columns called 'v'"),
+        ("t,x,v,u\n" + "0" * 200_000, "line 2 has 200,000 letters; expected a row of numbers"),
         ("", "is empty"),
         ("t,x,v,u\n0,0,0,0\n", "has no episode"),
     ],
@@ -344,6 +356,8 @@ def test_words_of_a_command_name_patterns():
         assert config_io.stored_config(config_io.plain(config)) == config
     with pytest.raises(ConfigError, match="data_control=after is not a choice"):
         config_io.parse({"data_control": "after"})
+    with pytest.raises(ConfigError, match=r"data_control=before needs data=; expected both, or neither"):
+        config_io.parse({"data_control": "before"})
 
 
 # Files that need a library

@@ -29,7 +29,8 @@ def written(path: Path, header: str, rows: np.ndarray) -> str:
 def typed(text: str) -> tuple[str, ...]:
     """What the word data_columns=[...] in a message makes of that setting, typed as it is there."""
     name, _, value = text[text.index("data_columns=[") :].partition("=")
-    return config_io.parse({name: value[: value.index("]", value.rindex('"') if '"' in value else 0) + 1]}).data_columns
+    columns = value[: value.index("]", value.rindex('"') if '"' in value else 0) + 1]
+    return config_io.parse({"data": "any.csv", name: columns}).data_columns
 
 
 def first(file: str, task, columns=()):
@@ -285,7 +286,7 @@ def test_a_column_too_many_that_counts_rows_or_is_the_time_is_told(header, more,
     assert told in str(refused.value)
     assert f"data_columns={columns}" in str(refused.value)
     if columns:  # and what it says to type is read
-        (one, *_), notes = read([file], cart(), config_io.parse({"data_columns": columns}).data_columns)
+        (one, *_), notes = read([file], cart(), config_io.parse({"data": file, "data_columns": columns}).data_columns)
         np.testing.assert_allclose(one.trajectory.x[:, 0], COLUMNS[:9, 0], atol=1e-6)
         assert not any("resampled" in note for note in notes)
 

@@ -487,6 +487,7 @@ def test_a_round_has_gained_what_lowers_the_mean_by_more_than_the_standard_error
     assert judged(before, before - 0.95 * error)
     assert not judged(before, before - 1.05 * error)
     assert judged(before, before + 1)
+    assert not judged(before, np.append(before - 1.5 * error, np.nan))  # a step under bad numbers says nothing
 
 
 def test_each_iteration_has_its_width_wherever_the_search_is_cut():

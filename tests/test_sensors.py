@@ -30,8 +30,8 @@ from pegasus_jax.runs import check, config_io, facts
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.start import preset
 from pegasus_jax.tasks.remembered import remembering, smoothed
-from pegasus_jax.tasks.sensed import coordinates, sensed
-from pegasus_jax.types import Batch, Dataset, Dynamics, ModelLearner, Prediction, Scenarios, TrainState
+from pegasus_jax.tasks.sensed import coordinates, reduced, sensed
+from pegasus_jax.types import Batch, Cost, Dataset, Dynamics, ModelLearner, Prediction, Scenarios, TrainState
 from probes import PLAIN, cart, linear_policy, tiny
 
 H, DT = 8, 0.3
@@ -339,6 +339,14 @@ def test_sensors_that_cannot_be_are_one_line(words, part):
         tasks.of_config(config_io.parse({"task": "cartpole", **dict(word.split("=", 1) for word in words.split())}))
     assert part in str(refused.value)
     assert len(str(refused.value).splitlines()) == 1
+
+
+def test_an_early_end_by_what_is_not_measured_is_refused():
+    """It would be told 0, and never come."""
+    task = tasks.make("cartpole")._replace(stop=lambda x: jnp.abs(x[0]) > 40)
+    with pytest.raises(ConfigError, match=r"the stop depends on x \[m\], entry 0, which is not measured"):
+        reduced(task._replace(cost=Cost(lambda x: jnp.cos(x[3]))), [1, 2, 3])
+    reduced(task, [0, 3])
 
 
 class Slide(gymnasium.Env):

@@ -105,6 +105,15 @@ def test_settings_that_cannot_be_are_one_line(words, said):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 and no more"])
+def test_a_damaged_reference_is_one_line(content, tmp_path):
+    file = tmp_path / "path.npz"
+    file.write_bytes(content)
+    with pytest.raises(ConfigError, match=r"path.npz cannot be read as times and values: ") as caught:
+        tasks.of_config(parse(task="cartpole", cost=price, reference=str(file), goals=goals))
+    assert "\n" not in str(caught.value)
+
+
 # What a cost gets, and when
 
 

@@ -129,3 +129,8 @@ def test_no_folder_is_added_twice(here):
 def test_a_function_of_a_program_is_given_again_as_it_can_be(setting, word):
     with pytest.raises(ConfigError, match=re.escape(f"go on in Python: train(resume=RUN, {word})")):
         user_code.load(setting, "__main__:<lambda>")
+
+
+def test_a_module_has_a_name() -> None:
+    with pytest.raises(ConfigError, match=r"cost=\.robot:cost cannot be imported: expected cost=module:function"):
+        user_code.load("cost", ".robot:cost")

@@ -52,6 +52,14 @@ def drawn(share, states, angles=(), around=0.0, succeeded=True):
     return np.asarray(found.mixed)
 
 
+def test_the_rows_of_millions_are_in_use_too():
+    """A row's place times their number has no 32 bits."""
+    size = 4_300_000
+    data = Dataset(jnp.arange(size, dtype=jnp.float32)[:, None], jnp.zeros((1, 1)), jnp.zeros((1, 1)), jnp.int32(size))
+    kept = np.asarray(remember(None, run_state(data), angles=(), varies=np.ones(1, bool)).states)[:, 0]
+    np.testing.assert_array_equal(kept, np.arange(STATES) * size // STATES)
+
+
 @pytest.mark.parametrize("size", [1, 7, STATES, 600])
 def test_the_states_are_the_rows_in_use_evenly(size):
     kept = np.asarray(remembered(rows(size)).states)

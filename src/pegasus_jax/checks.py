@@ -30,9 +30,11 @@ SIZES = {
     "delay": 100,
     "eval_episodes": 10**5,
     "trials": 10**4,
+    "periods": 10**6,
     "rows": 10**7,
     "dt": 10**4,
 }
+DIGITS = 20  # of a whole number; Python itself refuses to read thousands
 
 
 class ConfigError(ValueError):
@@ -278,7 +280,10 @@ def whole(name: str, text: str) -> int:
     if not text.removeprefix("-").isdecimal():
         raise ConfigError(f"{name}={text} is not a whole number; for example {name}=20")
     least = 1 if name in ("episodes", "seeds", "jobs") else 0
-    check_range(name, int(text), least, 2**32 - 1 if name == "seed" else SIZES["trials"])
+    most = 2**32 - 1 if name == "seed" else SIZES.get(name, SIZES["trials"])
+    if len(text) > DIGITS:
+        raise ConfigError(f"{name}={text[:DIGITS]}... has {len(text)} digits; expected a number in [{least}, {most}]")
+    check_range(name, int(text), least, most)
     return int(text)
 
 

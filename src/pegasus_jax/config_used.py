@@ -8,6 +8,8 @@ from typing import Any
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import TASKS, Config, Explore, uses
 
+NEEDS = {"constraint_bound": "constraint", "data_columns": "data", "data_control": "data", "init_parts": "init"}
+
 
 def check_config(config: Config) -> None:
     """Raises ConfigError for a setting of a plant's own that a config changes, and its task does not use."""
@@ -24,6 +26,13 @@ def check_used(task: str, given: Mapping[str, Any]) -> None:
                 f"{key}={shown(value)} is of no use with task={task}; the nearest task that uses it is"
                 f" task={_nearest_of(task, of_some[key])}"
             )
+
+
+def check_needed(config: Config, given: Mapping[str, Any]) -> None:
+    """Raises ConfigError for a setting that was given, and is of no use without another one."""
+    for key, need in NEEDS.items():
+        if key in given and not getattr(config, need):
+            raise ConfigError(f"{key}={shown(given[key])} needs {need}=; expected both, or neither")
 
 
 def used_by() -> dict[str, tuple[str, ...]]:

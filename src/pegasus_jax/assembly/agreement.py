@@ -42,6 +42,7 @@ def otherwise(config: Config, task: Task) -> list[tuple[str, str]]:
     named = any(name in str(task.state_names) for name in config.state_names)
     facts: list[tuple[str, str, Any]] = [
         *((name, name, lacks(getattr(config, name), name)) for name in ("stop", "constraint", "prior", "reference")),
+        ("starts", "starts", lacks(config.starts or None, "starts")),
         ("goals", "goal", lacks(config.goals or config.goal_low or None, "goal")),
         ("explore.policy", "guide", lacks(config.explore.policy, "guide")),
         *((name, name, differs(name)) for name in ("horizon", "dt", "success", "stop_cost")),

@@ -37,7 +37,8 @@ def remember(posterior: Any, state: RunState, *, angles: tuple[int, ...], varies
 
     `varies` [D] bool are the entries of x that differ between the starts of episodes.
     """
-    rows = jnp.arange(STATES) * state.data.size // STATES
+    i, (each, rest) = jnp.arange(STATES), jnp.divmod(state.data.size, STATES)
+    rows = i * each + i * rest // STATES  # i size / STATES, and no product too large for 32 bits
     states = join(state.data.x, state.data.memory)[rows]
     spread = jnp.std(difference(states, states[0], angles), 0)
     stays = jnp.all(state.data.y == 0, 0) & (state.data.size > 0)  # rows that are not in use are 0

@@ -32,8 +32,9 @@ def after_row(progress: Progress, row: Any, value: Array) -> Progress:
     policy is expected to cost. A round has gained nothing where their mean is not lower than that of the round before
     by more than the standard error of the difference.
     """
-    counted = jnp.where(row.counts, value, 0.0)
-    count, total = progress.count + row.counts, progress.total + counted
+    counts = row.counts & jnp.isfinite(value)  # a step under bad numbers changes nothing
+    counted = jnp.where(counts, value, 0.0)
+    count, total = progress.count + counts, progress.total + counted
     squares = progress.squares + counted**2
     mean = total / count
     variance = jnp.maximum(squares / count - mean**2, 0) / jnp.maximum(count - 1, 1)

@@ -24,6 +24,9 @@ def of_csv(path: Path) -> Table:
     kept = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]
     if not kept:
         raise ConfigError(f"{path} is empty; expected a header and rows of numbers")
+    for number, line in kept:
+        if len(line) > csv.field_size_limit():
+            raise ConfigError(f"{path} line {number} has {len(line):,} letters; expected a row of numbers")
     comma = _mark([line for _, line in kept])
     cells = [_cells(f"{path} line {number}", line, comma) for number, line in kept]
     while len({*map(len, cells)}) == 1 < len(cells[0]) and not any(row[-1] for row in cells):  # of a comma at its end

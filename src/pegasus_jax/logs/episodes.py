@@ -148,7 +148,8 @@ def periods(one: Segment, task: Task, note: Note) -> Segment | None:
         return None
     grid = one.t[0] + task.dt * np.arange(count + 1)
     turning = [i in task.angles for i in measured(task)]
-    x = np.column_stack([interpolated(grid, one.t, *pair) for pair in zip(one.x.T, turning, strict=True)])
+    inside = np.minimum(grid, one.t[-1])  # the last may be later by a rounding
+    x = np.column_stack([interpolated(inside, one.t, *pair) for pair in zip(one.x.T, turning, strict=True)])
     held = np.searchsorted(one.t, grid[:-1] + task.dt / 2, side="right") - 1
     within = np.minimum((one.t[:-1] - one.t[0] + slack) // task.dt, count - 1).astype(int)  # the period of each row
     note(f"a row every {np.median(steps):.3g} s or so: resampled to dt={task.dt:g}")

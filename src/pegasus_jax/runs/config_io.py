@@ -13,7 +13,7 @@ from yaml import YAMLError
 from pegasus_jax.checks import FUNCTION, ConfigError, did_you_mean, expected, shown
 from pegasus_jax.config import KINDS, TASKS, Config, check_spread, uses
 from pegasus_jax.config_models import sized
-from pegasus_jax.config_used import check_used, leaves
+from pegasus_jax.config_used import check_needed, check_used, leaves
 from pegasus_jax.presets import FOR_ANY, WORDS, own, preset
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.runs.removed import refuse, today
@@ -68,6 +68,7 @@ def parse(words: Mapping[str, Any], options: Sequence[str] = ()) -> Config:
             raise ConfigError(f"{key} is not a setting{_of_others(key)}; {_hint(key, [*known, *NAMED, *options])}")
         check_used(config.task, {key: words[key]})
     changed = override(config, values(words))
+    check_needed(changed, words)
     if "start_std" in words:
         check_spread(changed)
     if changed.legs != config.legs:
@@ -113,6 +114,8 @@ def _json(key: str, value: Any) -> str:
 
 def without_random(words: Mapping[str, Any]) -> dict[str, Any]:
     """The words, with no random episode unless they ask for some, where there is a first policy or a simulator."""
+    if "explore.policy" in words:  # which is to drive some
+        return dict(words)
     parts = str(words.get("init_parts", "policy"))
     knows = words.get("prior") not in (None, "null") or (words.get("init") not in (None, "null") and "policy" in parts)
     return ({"explore.trials": 0} if knows else {}) | dict(words)

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pegasus_jax import tasks
-from pegasus_jax.checks import ConfigError, check_range, shown
+from pegasus_jax.checks import SIZES, ConfigError, check_range, shown
 from pegasus_jax.config import Config, Sensors
 from pegasus_jax.episode import drive
 from pegasus_jax.math.delays import MOST, Delay, delay_of, enough, rows_of
@@ -23,7 +23,7 @@ LONGER = 3  # times the periods that were asked for, at most, where episodes end
 SURE = 0.9
 # Two encoders of a flexible shaft, 60 seeds of 200 periods: by .1 five were sure of a wrong delay, by .2 none.
 AMPLITUDE = 0.2
-ALL = 10**6  # periods at most
+ALL = SIZES["periods"]  # at most
 
 
 class Plan(NamedTuple):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pegasus_jax import sharding
-from pegasus_jax.checks import SIZES, ConfigError
+from pegasus_jax.checks import SIZES, ConfigError, different
 from pegasus_jax.config import Config
 from pegasus_jax.runs import begin, config_io, logged, writers
 from pegasus_jax.runs.files import write_whole
@@ -129,4 +129,5 @@ def seed_list(text: str) -> list[int]:
         raise ConfigError(
             f"seeds={text} names no seeds, or more than {SIZES['trials']:,}; for example seeds=0-9 or seeds=0,3,7"
         )
+    different("seeds", tuple(seeds))
     return seeds

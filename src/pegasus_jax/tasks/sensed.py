@@ -18,6 +18,8 @@ from pegasus_jax.task import Task
 from pegasus_jax.tasks.terms import alone
 from pegasus_jax.types import Cost
 
+FAR = (1.0, 10.0, 100.0, 1000.0)  # factors of states at which an early end is looked for
+
 
 def sensed(task: Task, sensors: Sensors) -> Task:
     """The task whose state is what can be known of it: what is measured, and its rates where they are computed.
@@ -73,7 +75,7 @@ def reduced(task: Task, kept: Sequence[int]) -> Task:
     """The task of some of its entries; the cost and `stop` still get all of them, the others as 0.
 
     A constraint, a simulator and a first controller are made of the task that this gives. Raises ConfigError where the
-    cost depends on an entry that is left out.
+    cost or `stop` depends on an entry that is left out.
     """
     states, kept = len(task.state_names), list(kept)
     place, plant, stop = np.array(kept), task.plant, task.stop
@@ -108,18 +110,28 @@ def _of(cost: Cost, whole: Any, place: np.ndarray) -> Cost:
 
 
 def _blind(task: Task, missing: Sequence[int]) -> None:
-    """Raises ConfigError where the cost of some states changes with an entry that is missing."""
+    """Raises ConfigError where the cost of some states, or an end there, changes with an entry that is missing."""
     draw = np.random.default_rng(0)
     mean, std = np.asarray(task.start_mean, float), np.asarray(task.start_std, float) + 1.0
     states = jnp.asarray(mean + std * draw.normal(size=(32, len(mean))))
     cost = alone(task)
     slopes = jax.vmap(jax.grad(lambda x: cost(x).astype(float)))(states)
     for entry in missing:
-        if np.any(np.asarray(slopes)[:, entry] != 0):
+        depends = {"cost": np.any(np.asarray(slopes)[:, entry] != 0), "stop": _stops_by(task, states - mean, entry)}
+        for what in (name for name, does in depends.items() if does):
             raise ConfigError(
-                f"the cost depends on {task.state_names[entry]}, entry {entry}, which is not measured; measure it, or"
-                " give a cost of what is"
+                f"the {what} depends on {task.state_names[entry]}, entry {entry}, which is not measured; measure it, or"
+                f" give a {what} of what is"
             )
+
+
+def _stops_by(task: Task, around: jax.Array, entry: int) -> bool:
+    """Whether an early end depends on an entry: it has no gradient, so states from near to far are compared."""
+    if task.stop is None:
+        return False
+    x = jnp.concatenate([scale * around for scale in FAR])
+    ends = jax.vmap(task.stop)
+    return bool(np.any(np.asarray(ends(x)) != np.asarray(ends(x.at[:, entry].set(0.0)))))
 
 
 def delayed(task: Task, delay: int) -> Task:

@@ -109,7 +109,7 @@ def read(file: Path, what: str) -> tuple[np.ndarray, np.ndarray]:
         raise ConfigError(f"{what} is not there; expected a file .csv or .npz, or module:function of a time [s]")
     try:
         found = _npz(file) if file.suffix == ".npz" else _csv(file)
-    except (ValueError, KeyError, OSError) as error:
+    except Exception as error:  # of a damaged or foreign file NumPy and zipfile raise whatever they come across
         raise ConfigError(f"{what} cannot be read as times and values: {' '.join(str(error).split())}") from error
     if found.shape[1] < 2 or not len(found):
         raise ConfigError(f"{what} has no values beside the times [s], which come first")

@@ -38,7 +38,7 @@ def load(setting: str, name: str | Callable[..., Any], not_from: Path | None = N
             f"{what} is a function of the Python program that began the run, which no other can import; define it in a"
             f" module of its own, or go on in Python: train(resume=RUN, {again})"
         )
-    if not (module and function):
+    if not (module and function) or module.startswith("."):
         raise ConfigError(f"{what} cannot be imported: expected {setting}=module:function, as in {setting}=robot:cost")
     found = importing(what, module, not_from)
     with blamed(what):
