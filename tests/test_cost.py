@@ -169,6 +169,16 @@ def test_a_widened_cost_is_that_of_a_smaller_error(x64):
     np.testing.assert_allclose(of_gaussian(3.0, x, root @ root.T), expected, rtol=1e-10)
 
 
+def test_what_a_gaussian_state_costs_is_as_its_user_says_at_the_costs_own_width(x64):
+    """Wider it is a mean over nodes, of the wider cost: nobody said what that is."""
+    own = Cost(lambda x: 1 - jnp.exp(-0.5 * x @ x), lambda mean, cov: 7.0 + 0 * mean[0])
+    mean, cov = jnp.ones(2), 0.1 * jnp.eye(2)
+    at = jax.jit(lambda factor: cost.widened(own, factor).expected(mean, cov))
+    assert at(1.0) == cost.widened(own, 1).expected(mean, cov) == 7.0
+    nodes = cost.expectation(cost.widened(Cost(own.of_state), 2.0))(mean, cov)
+    assert at(2.0) == pytest.approx(float(nodes), rel=1e-12)
+
+
 def test_any_cost_is_widened_as_a_gaussian_one_is(x64):
     """The closed form, its slope and nearly its expectation, of a cost of which only the values are known."""
     known = cost.saturating(lambda x: jnp.array([x[0] - 0.3, 0.4 * x[1]]), 0.7, ())

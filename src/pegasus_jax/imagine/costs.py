@@ -72,15 +72,22 @@ def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Ar
 def widened(cost: Cost, factor: Array | float) -> Cost:
     """The cost of `factor` times the width: in closed form where that is known, else 1 - (1 - c)^(1 / factor^2).
 
-    They are the same for c = 1 - exp(-e^2 / (2 width^2)); for any other c in [0, 1] the order of states stays.
+    They are the same for c = 1 - exp(-e^2 / (2 width^2)); for any other c in [0, 1] the order of states stays. What a
+    Gaussian state costs, where only the cost itself can say it, is known at its own width alone, and a mean over nodes
+    at any other.
     """
+    if cost.widen is not None:
+        return cost.widen(factor)
 
     def of_state(x: Array) -> Array:
         rest = 1 - _scalar(cost.of_state(x))
         held = jnp.maximum(rest, jnp.finfo(rest.dtype).eps)  # at c = 1 the slope is infinite: there take that of c
         return 1 - held**factor**-2 + (held - rest)
 
-    return Cost(of_state) if cost.widen is None else cost.widen(factor)
+    if (known := cost.expected) is None:
+        return Cost(of_state)
+    by_nodes = expected_by_nodes(of_state)
+    return Cost(of_state, lambda *moments: jax.lax.cond(jnp.equal(factor, 1), known, by_nodes, *moments))
 
 
 def blind_to_memory(cost: Cost, states: int) -> Cost:
