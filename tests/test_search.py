@@ -164,14 +164,14 @@ def test_the_search_finds_the_best_gain(plant):
     assert info.skipped == 0
 
 
-def test_a_known_control_is_found_through_limits_and_costs():
+@pytest.mark.parametrize("optimizer", [optax.adam(0.05), optax.lbfgs()], ids=["adam", "lbfgs"])
+def test_a_known_control_is_found_through_limits_and_costs(optimizer):
     """One step of the cart probe, from rest at 1 m: the best force within the limits is a number."""
     task = cart(horizon=1)
     start = jnp.array([1.0, 0.0])
     cost_of = lambda u: task.cost.of_state(task.plant.step(start, u))  # noqa: E731
     grid = np.linspace(-2, 2, 4001, dtype=np.float32)[:, None]
     best = grid[np.argmin(jax.vmap(cost_of)(grid))]
-    optimizer = optax.adam(0.05)
     learner, _ = gradient_search(
         jax.random.key(0),
         TrainState(jnp.zeros(1), optimizer.init(jnp.zeros(1))),

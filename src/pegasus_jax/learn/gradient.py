@@ -46,7 +46,8 @@ def gradient_search(
         scenarios = sampler.redraw(key, i, scenarios, posterior, i == first)
         value, gradient = jax.value_and_grad(objective)(learner.params, posterior, scenarios)
         finite = is_finite((value, gradient))
-        updates, state = update_if(finite, optimizer, gradient, learner, value=value)
+        along = dict(value=value, grad=gradient, value_fn=lambda params: objective(params, posterior, scenarios))
+        updates, state = update_if(finite, optimizer, gradient, learner, **along)
         learner = TrainState(optax.apply_updates(learner.params, updates), state)
         info = SearchInfo(value, optax.tree.norm(gradient), ~finite)
         return (learner, scenarios), info
