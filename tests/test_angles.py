@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from pegasus_jax.math.angles import difference, encode, feature_names, wrap
+from pegasus_jax.math.gaussian import sincos
 
 PI = np.float32(np.pi)
 angle = st.floats(-50, 50, width=32) | st.floats(3, 4, width=32) | st.floats(-4, -3, width=32)
@@ -25,6 +26,19 @@ def test_features_are_the_rest_then_sines_then_cosines(angles):
     assert len(names) == features.shape[-1]
     for i in angles:  # the names stand where the features are
         np.testing.assert_allclose(features[:, names.index(f"sin {'abcd'[i]}")], np.sin(x[:, i]), atol=1e-6)
+
+
+@pytest.mark.parametrize("place", [-1, 4])
+def test_an_angle_that_is_no_dimension_is_refused(place):
+    """JAX would take the last, or none."""
+    x = jnp.zeros(4)
+    for made in (
+        lambda: encode(x, (place,)),
+        lambda: difference(x, x, (place,)),
+        lambda: sincos(x, jnp.eye(4), (place,)),
+    ):
+        with pytest.raises(ValueError, match=rf"angles=\({place},\) has {place}; expected indices from 0 to 3"):
+            made()
 
 
 @given(angle)

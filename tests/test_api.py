@@ -618,6 +618,22 @@ def test_a_cost_picks_entries_by_an_array_also_where_compose_is_traced(entries: 
         jax.eval_shape(lambda scale: pg.compose(CONFIG, TASK, cost=lambda x: scale * x[2] ** 2), jnp.ones(()))
 
 
+def test_what_is_built_needs_numbers_that_nobody_traces() -> None:
+    """One line, in place of an error from NumPy; what only runs may be traced."""
+
+    def improved(scale: jax.Array, **how: Any) -> Any:
+        config = replace(CONFIG, search=replace(CONFIG.search, **how))
+        experiment = pg.compose(config, TASK, cost=lambda x: 1 - jnp.exp(-jnp.sum(x**2) * scale))
+        state = experiment.init(key())
+        return experiment.improve(experiment.add_episode(state, experiment.collect(state)))[1][1].objective
+
+    with pytest.raises(pg.ConfigError, match=r"traces, and search\.cost_width_start=null looks at"):
+        jax.eval_shape(improved, jnp.ones(()))
+    jax.eval_shape(partial(improved, cost_width_start=1.0), jnp.ones(()))
+    with pytest.raises(pg.ConfigError, match="the task's control_high is traced by jit, vmap or grad"):
+        jax.eval_shape(lambda high: pg.compose(CONFIG, TASK._replace(control_high=high)).init(key()), jnp.ones(1))
+
+
 def test_the_cost_of_a_task_is_one_of_an_objective() -> None:
     given = drawn()
     assert jax.jit(J)(*given) == jax.jit(partial(J, cost=TASK.cost))(*given)
@@ -631,6 +647,9 @@ WRONG_TASKS = [
     (dict(horizon=10.0), r"the task's horizon=10\.0 is not a whole number"),
     (dict(dt=-0.1), r"the task's dt=-0\.1 is no control period; expected a number of seconds above 0"),
     (dict(dt=float("nan")), r"the task's dt=nan is no control period"),
+    (dict(dt=None), r"the task's dt=null is no control period"),
+    (dict(angles=(0, 0)), r"the task's angles=\[0,0\] names 0 twice; the nearest is \[0\]"),
+    (dict(goal=lambda key: 1.0), r"the task's goal is of type function; expected Signal\(value, units\)"),
     (dict(start_mean=[float("nan"), 0.0]), r"the task's start_mean is \[nan, 0\.0\]; expected finite numbers"),
     (dict(control_high=[float("inf")]), r"the task's control_high is \[inf\]; expected finite numbers"),
     (

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.core import Tracer
 
-from pegasus_jax.checks import ConfigError
+from pegasus_jax.checks import ConfigError, different, shown
 from pegasus_jax.types import NO_MEMORY, Array, Hindsight, Memory
 
 
@@ -71,6 +71,17 @@ class Task(NamedTuple):
         return self.environment is not None or self.stop is not None
 
 
+def known(task: Task, field: str) -> np.ndarray:
+    """The numbers of a field by which something is built. Raises ConfigError for those that JAX traces."""
+    value: Any = getattr(task, field)
+    if isinstance(value, Tracer):
+        raise ConfigError(
+            f"the task's {field} is traced by jit, vmap or grad, and what is built here depends on it; expected numbers"
+            " that are known before"
+        )
+    return np.asarray(value, float)
+
+
 def checked(task: Task) -> Task:
     """The task itself. Raises ConfigError, in one line, where its fields do not agree.
 
@@ -89,10 +100,15 @@ def checked(task: Task) -> Task:
             raise ConfigError(f"the task's {name} is {given}; expected finite numbers")
     if not isinstance(task.horizon, int | np.integer) or task.horizon < 1:
         raise ConfigError(f"the task's horizon={task.horizon!r} is not a whole number of control periods, at least 1")
-    if not isinstance(task.dt, Tracer) and not 0 < task.dt < np.inf:
-        raise ConfigError(f"the task's dt={task.dt:g} is no control period; expected a number of seconds above 0")
+    dt: Any = task.dt
+    if not isinstance(dt, Tracer) and not (isinstance(dt, float | int | np.number | np.ndarray) and 0 < dt < np.inf):
+        raise ConfigError(f"the task's dt={shown(dt)} is no control period; expected a number of seconds above 0")
     if wrong := [angle for angle in task.angles if angle not in range(states)]:
         raise ConfigError(f"the task's angles={task.angles} has {wrong[0]}; its {states} states are 0 to {states - 1}")
+    different("the task's angles", task.angles)
+    for name in ("goal", "reference"):
+        if not isinstance(given := getattr(task, name), Signal | None):
+            raise ConfigError(f"the task's {name} is of type {type(given).__name__}; expected Signal(value, units)")
     if not any(isinstance(limit, Tracer) for limit in (task.control_low, task.control_high)):
         for name, low, high in zip(task.control_names, task.control_low, task.control_high, strict=True):
             if not low < high:

@@ -6,7 +6,6 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.sharding import Mesh
 
 from pegasus_jax import config as settings
@@ -23,7 +22,7 @@ from pegasus_jax.learn.data import room
 from pegasus_jax.models.residual import on_differences, residual
 from pegasus_jax.policies.rate_limited import rate_limited
 from pegasus_jax.sharding import over_particles
-from pegasus_jax.task import Task, checked
+from pegasus_jax.task import Task, checked, known
 from pegasus_jax.tasks.cost_check import traced
 from pegasus_jax.tasks.remembered import remembering
 from pegasus_jax.types import (
@@ -125,9 +124,7 @@ def assembled(config: settings.Config, task: Task, mesh: Mesh | None, logged: in
         search_steps=config.search.steps,
         imagine=searching.imagine,
         expect=searching.expect if visits else None,
-        remember=partial(visited.remember, angles=task.angles, varies=np.asarray(task.start_std) > 0)
-        if visits
-        else None,
+        remember=partial(visited.remember, angles=task.angles, varies=known(task, "start_std") > 0) if visits else None,
         explore=explore_of(config.explore, task),
         explore_trials=config.explore.trials,
         first_search=settings.first_search(config) if task.prior is None else config.explore.trials,

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 
 from pegasus_jax import config as settings
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import costs
 from pegasus_jax.learn.schedule import SearchTable, search_table
 from pegasus_jax.learn.widening import SEEN, holding
@@ -66,7 +67,13 @@ def at_starts(task: Task) -> np.ndarray:
 
     # One program, where operation by operation would be twenty; it may be wanted while another one is traced.
     x = examples(task, STARTS)
-    return np.asarray(jax.jit(all_of).lower(x).compile()(x))
+    program = jax.jit(all_of).trace(x)
+    if len(program.jaxpr.jaxpr.invars) > 1:  # beside the states
+        raise ConfigError(
+            "the cost depends on a number that jit, vmap or grad traces, and search.cost_width_start=null looks at what"
+            " it is where episodes start; search.cost_width_start=1 does not"
+        )
+    return np.asarray(program.lower().compile()(x))
 
 
 def scale_for(found: np.ndarray) -> float:

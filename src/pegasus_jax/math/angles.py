@@ -11,10 +11,21 @@ __all__ = ["difference", "encode", "feature_names", "wrap"]
 
 
 def encode(x: Array, angles: tuple[int, ...]) -> Array:
-    """Features [..., F] of states x [..., D]: the other dimensions, then all sines, then all cosines; F = D + A."""
+    """Features [..., F] of states x [..., D]: the other dimensions, then all sines, then all cosines; F = D + A.
+
+    Raises ValueError for an angle that is none of the D dimensions.
+    """
+    check_places(angles, x.shape[-1])
     plain = pick(x, [i for i in range(x.shape[-1]) if i not in angles])
     angle = pick(x, angles)
     return jnp.concatenate([plain, jnp.sin(angle), jnp.cos(angle)], axis=-1)
+
+
+def check_places(angles: tuple[int, ...], size: int) -> None:
+    """Raises ValueError unless the indices of angles are dimensions, from 0 on; JAX would take others, or none."""
+    for angle in angles:
+        if not 0 <= angle < size:
+            raise ValueError(f"angles={angles} has {angle}; expected indices from 0 to {size - 1}")
 
 
 def pick(x: Array, indices: Sequence[int]) -> Array:
@@ -36,4 +47,5 @@ def wrap(angle: Array) -> Array:
 def difference(after: Array, before: Array, angles: tuple[int, ...]) -> Array:
     """after - before [..., D], the angle dimensions wrapped: a roll that crosses 180 degrees has not jumped."""
     change = after - before
+    check_places(angles, change.shape[-1])
     return change.at[..., np.array(angles, int)].set(wrap(change[..., np.array(angles, int)])) if angles else change

@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from pegasus_jax.math.angles import check_places
 from pegasus_jax.math.linalg import cholesky
 from pegasus_jax.types import Array
 
@@ -119,6 +120,7 @@ def sincos(mean: Array, cov: Array, angles: tuple[int, ...]) -> Image:
     `angles` are the indices of the angle dimensions [rad], maybe none; F = D + len(angles). Exact (PILCO's gTrig).
     """
     size = mean.shape[0]
+    check_places(angles, size)
     plain = np.array([i for i in range(size) if i not in angles], int)
     twice = np.array([*angles, *angles], int)  # the dimension behind each wave
     sine, cosine = jnp.sin(mean[twice[: len(angles)]]), jnp.cos(mean[twice[: len(angles)]])

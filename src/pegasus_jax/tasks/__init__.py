@@ -15,7 +15,7 @@ from pegasus_jax.checks import ConfigError, choice, did_you_mean
 from pegasus_jax.config import GYM, MJCF, Config
 from pegasus_jax.imagine.costs import saturating
 from pegasus_jax.math import circles
-from pegasus_jax.task import Task
+from pegasus_jax.task import Task, known
 from pegasus_jax.tasks import circled, constrained, guide, priors, sensed, terms, user_code
 from pegasus_jax.tasks.own_plants import TASKS
 from pegasus_jax.tasks.signals import FILES, named, with_signals
@@ -121,7 +121,7 @@ def control_units(task: Task) -> Any:
 
     A network whose inputs are forces of 10 N begins saturated by them: docs/decisions.md 0039.
     """
-    half = (np.asarray(task.control_high, float) - np.asarray(task.control_low, float)) / 2
+    half = (known(task, "control_high") - known(task, "control_low")) / 2
     turning, shown = memory.seen_angles(task), memory.seen_names(task)
     before = range(1, 1 + len(shown))
     of = {name: unit for i in before for name, unit in zip(terms.past(task, i), half, strict=True)}

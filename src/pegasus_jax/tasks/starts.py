@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.task import Task
+from pegasus_jax.task import Task, known
 from pegasus_jax.tasks import circled
 from pegasus_jax.types import Array, Key
 
@@ -25,7 +25,7 @@ def start(key: Key, *, task: Task) -> Array:
 def examples(task: Task, count: int) -> np.ndarray:
     """First states [count, D] of the task, always the same. In NumPy: nothing is compiled for them."""
     draws = np.random.default_rng(0)
-    mean, std = np.asarray(task.start_mean, float), np.asarray(task.start_std, float)
+    mean, std = known(task, "start_mean"), known(task, "start_std")
     if task.starts is None:
         return mean + std * draws.normal(size=(count, len(mean)))
     places = np.asarray(task.starts, float)[draws.integers(len(task.starts), size=count)]
