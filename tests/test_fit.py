@@ -8,8 +8,10 @@ import numpy as np
 import optax
 import pytest
 
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.learn.data import minibatch
-from pegasus_jax.learn.fit import fit
+from pegasus_jax.learn.fit import fit, minibatches
+from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.types import Dataset, TrainState
 from probes import same
 
@@ -185,3 +187,15 @@ def test_more_data_does_not_trace_again():
         if trial == 4:
             once = traces
     assert traces == once
+
+
+@pytest.mark.parametrize(
+    ("what", "said"),
+    [
+        (lambda: minibatches(None, optax.adam(1e-3), batch_size=5.5), "batch_size=5.5 is not a whole number of rows"),
+        (lambda: ensemble(None, members=0), "members=0 is out of range"),
+    ],
+)
+def test_pieces_that_cannot_be_are_one_line(what, said):
+    with pytest.raises(ConfigError, match=said):
+        what()

@@ -79,3 +79,9 @@ def test_a_cost_is_of_the_gaussian_or_of_the_particles(spread):
     found = costs.of_narrow(cost, ANGLES)(x[None])
     expected = 0.7 if spread < 1 else np.mean([quadratic(row) for row in x])
     np.testing.assert_allclose(found, [[expected]], rtol=1e-5)
+
+
+def test_one_particle_has_no_covariance():
+    for made in (matching.match, matching.narrow((0,))):
+        with pytest.raises(ValueError, match=r"x of shape \(1, 2\) is 1 particles; moment matching needs at least 2"):
+            made(jnp.zeros((1, 2)), jnp.zeros((1, 2)))

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.models.networks import ACTIVATIONS, INITIALIZERS, MLP, orthogonal
 
 
@@ -72,3 +73,9 @@ def test_orthogonal_weights_are_those_of_jax_without_its_library_of_linear_algeb
     several = jax.jit(jax.vmap(lambda key: orthogonal(key, shape)))
     np.testing.assert_allclose(several(keys), expected, atol=1e-5)
     assert "custom_call" not in several.lower(keys).as_text()
+
+
+@pytest.mark.parametrize("kind", ["initializer", "activation"])
+def test_a_kind_that_there_is_not_is_one_line(kind) -> None:
+    with pytest.raises(ConfigError, match=rf"{kind}=tanhh is not a choice; "):
+        MLP((4,), 1, **{kind: "tanhh"}).init(jax.random.key(0), jnp.zeros(2), [None, None])

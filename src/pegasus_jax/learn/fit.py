@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from pegasus_jax.checks import check_range
+from pegasus_jax.checks import ConfigError, check_range
 from pegasus_jax.learn.data import minibatch
 from pegasus_jax.learn.updates import is_finite, update_if
 from pegasus_jax.shapes import check_data
@@ -72,9 +72,11 @@ def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
 def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch_size: int) -> ModelLearner:
     """The fitter that takes `optimizer`'s steps on minibatches; each fit goes on with the moments of the one before.
 
-    Raises ConfigError for a `batch_size` [rows] below 1.
+    Raises ConfigError for a `batch_size` [rows] below 1, or no whole number.
     """
     check_range("batch_size", batch_size, 1)
+    if batch_size % 1:
+        raise ConfigError(f"batch_size={batch_size} is not a whole number of rows; for example batch_size=100")
 
     def run(key: Key, learner: TrainState, data: Dataset, steps: int) -> tuple[TrainState, FitInfo]:
         return fit(

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from pegasus_jax.checks import check_range
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 from pegasus_jax.vectorized import Vectorized
 
@@ -26,7 +27,9 @@ def ensemble(member: Dynamics, members: int) -> Dynamics:
     A function alone follows a member drawn uniformly. The K functions of a rollout are dealt to the members in turn, so
     that each predicts for its own particles only, with the arithmetic of one model. Where that is not known, every
     member predicts for every particle and all but one answer is dropped; a copy of the weights each would cost more.
+    Raises ConfigError for no members.
     """
+    check_range("members", members, 1)
 
     def init(key: Key) -> Params:
         return jax.vmap(member.init)(jax.random.split(key, members))

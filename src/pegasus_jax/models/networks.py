@@ -8,6 +8,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from pegasus_jax.checks import choice
 from pegasus_jax.types import Array, Dropout, Key, Params, Prediction
 
 
@@ -65,6 +66,8 @@ class MLP(nn.Module):
     @nn.compact
     def __call__(self, x: Array, masks: Sequence[Array | None]) -> Array:
         """Outputs [..., outputs] for inputs x [..., F]; masks[i] broadcasts against layer i's input."""
+        choice("initializer", self.initializer, INITIALIZERS)
+        choice("activation", self.activation, ACTIVATIONS)
         kernel_init = INITIALIZERS[self.initializer]
         for i, width in enumerate((*self.hidden, self.outputs)):
             mask = masks[i]
