@@ -192,7 +192,10 @@ def test_more_data_does_not_trace_again():
 @pytest.mark.parametrize(
     ("what", "said"),
     [
-        (lambda: minibatches(None, optax.adam(1e-3), batch_size=5.5), "batch_size=5.5 is not a whole number of rows"),
+        (
+            lambda: minibatches(None, optax.adam(1e-3), batch_size=5.5),
+            "batch_size=5.5 is not a whole number; the nearest is 6",
+        ),
         (lambda: ensemble(None, members=0), "members=0 is out of range"),
     ],
 )

@@ -83,5 +83,7 @@ def test_a_cost_is_of_the_gaussian_or_of_the_particles(spread):
 
 def test_one_particle_has_no_covariance():
     for made in (matching.match, matching.narrow((0,))):
-        with pytest.raises(ValueError, match=r"x of shape \(1, 2\) is 1 particles; moment matching needs at least 2"):
+        with pytest.raises(
+            ValueError, match=r"x of shape \(1, 2\) is 1 particles; a covariance, as of moment matching, needs 2"
+        ):
             made(jnp.zeros((1, 2)), jnp.zeros((1, 2)))

@@ -103,6 +103,8 @@ def number(value: float) -> str:
 def size(name: str, value: int, low: int = 1) -> None:
     """Raises ConfigError unless a size, the last part of the setting's name in SIZES, is at least `low` and sane."""
     check_range(name, value, low, SIZES[name.rpartition(".")[2]])
+    if value % 1:
+        raise ConfigError(f"{name}={value} is not a whole number; the nearest is {value:.0f}")
 
 
 def sizes(section: str, config: Any, *names: str, low: int = 1) -> None:

@@ -72,9 +72,8 @@ def affine_error(error: Error, states: int, angles: tuple[int, ...]) -> tuple[Ar
 def widened(cost: Cost, factor: Array | float) -> Cost:
     """The cost of `factor` times the width: in closed form where that is known, else 1 - (1 - c)^(1 / factor^2).
 
-    They are the same for c = 1 - exp(-e^2 / (2 width^2)); for any other c in [0, 1] the order of states stays. What a
-    Gaussian state costs, where only the cost itself can say it, is known at its own width alone, and a mean over nodes
-    at any other.
+    They are the same for c = 1 - exp(-e^2 / (2 width^2)); for any other c in [0, 1] the order of states stays. An
+    `expected` without `widen` is known at its own width alone; at any other there is a mean over nodes.
     """
     if cost.widen is not None:
         return cost.widen(factor)
@@ -84,10 +83,8 @@ def widened(cost: Cost, factor: Array | float) -> Cost:
         held = jnp.maximum(rest, jnp.finfo(rest.dtype).eps)  # at c = 1 the slope is infinite: there take that of c
         return 1 - held**factor**-2 + (held - rest)
 
-    if (known := cost.expected) is None:
-        return Cost(of_state)
-    by_nodes = expected_by_nodes(of_state)
-    return Cost(of_state, lambda *moments: jax.lax.cond(jnp.equal(factor, 1), known, by_nodes, *moments))
+    known, nodes = cost.expected, expected_by_nodes(of_state)
+    return Cost(of_state, None if known is None else lambda *x: jax.lax.cond(jnp.equal(factor, 1), known, nodes, *x))
 
 
 def blind_to_memory(cost: Cost, states: int) -> Cost:
@@ -129,8 +126,7 @@ def normal_nodes(count: int, size: int) -> np.ndarray:
 
     The normal's quantiles of Sobol's sequence, each moved to the middle of its interval, as none may be at 0.
     """
-    # Never first in a thread beside another that imports PyTorch, as trackers do: SciPy asks for what a half-imported
-    # one has not got yet. See runs/job.py.
+    # Never first in a thread beside one that imports PyTorch: SciPy asks for what a half of it has not got. runs/job.py
     from scipy.stats import norm, qmc  # slow to import, and only a cost of one's own needs them
 
     intervals = 2 ** (count - 1).bit_length()
@@ -146,7 +142,6 @@ def of(cost: Cost, x: Array) -> Array:
 
 def of_particles(cost: Cost) -> Callable[[Array], Array]:
     """The cost of every particle: x [H, K, D] -> [H, K]. Raises ValueError where a state's cost is no scalar."""
-
     return jax.vmap(jax.vmap(partial(of, cost)))
 
 

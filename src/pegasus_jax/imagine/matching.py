@@ -20,10 +20,8 @@ WIDEST = 1.0
 def match(x: Array, z: Array) -> Array:
     """Particles [K, D] redrawn as mean + L z from the Gaussian fitted to x [K, D]; z [K, D] is standard normal.
 
-    Alg. 3 line 14, whose Sigma z is a slip of notation for L z with L L' = Sigma. Raises ValueError for one particle.
+    Alg. 3 line 14, whose Sigma z is a slip of notation for L z with L L' = Sigma.
     """
-    if len(x) < 2:
-        raise ValueError(f"x of shape {x.shape} is {len(x)} particles; moment matching needs at least 2")
     mean, cov = mean_and_cov(x)
     return mean + z @ cholesky(cov).T
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from pegasus_jax.checks import ConfigError, check_range
+from pegasus_jax.checks import size
 from pegasus_jax.learn.data import minibatch
 from pegasus_jax.learn.updates import is_finite, update_if
 from pegasus_jax.shapes import check_data
@@ -39,7 +39,7 @@ def fit(
     gradient that is not finite changes neither. An optimizer that searches along a line gets the loss of the same rows
     and noise. Raises ValueError for data of other shapes than a `Dataset` has, and for a batch of no rows.
     """
-    check_range("batch_size", batch_size, 1)
+    size("batch_size", batch_size)
     check_data(data)
     context = prepare(data)
 
@@ -74,9 +74,7 @@ def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, 
 
     Raises ConfigError for a `batch_size` [rows] below 1, or no whole number.
     """
-    check_range("batch_size", batch_size, 1)
-    if batch_size % 1:
-        raise ConfigError(f"batch_size={batch_size} is not a whole number of rows; for example batch_size=100")
+    size("batch_size", batch_size)
 
     def run(key: Key, learner: TrainState, data: Dataset, steps: int) -> tuple[TrainState, FitInfo]:
         return fit(

@@ -46,7 +46,9 @@ def _factor(cov: Array) -> tuple[Array, Array]:
 
 
 def mean_and_cov(x: Array) -> tuple[Array, Array]:
-    """Mean [D] and unbiased covariance [D, D] of particles x [K, D]."""
+    """Mean [D] and unbiased covariance [D, D] of particles x [K, D]. Raises ValueError for fewer than 2."""
+    if len(x) < 2:
+        raise ValueError(f"x of shape {x.shape} is {len(x)} particles; a covariance, as of moment matching, needs 2")
     mean = jnp.mean(x, 0)
     centered = x - mean
     return mean, centered.T @ centered / (x.shape[0] - 1)
