@@ -250,6 +250,25 @@ def test_a_file_that_the_disk_refuses_ends_the_command_in_one_line(whole: Path, 
 
 
 @pytest.mark.slow
+def test_pilco_learns_by_a_command(tmp_path: Path) -> None:
+    """It alone computes in 64 bits: whatever looks at its task before must too."""
+    pilco = ["model=ssgp", "policy=rbf", "algorithm=pilco", "trials=1", "fit.steps=3", "search.steps=3"]
+    done = call("train", "task=cartpole", *pilco, "eval_episodes=1", "out=run", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert len(store.trials(tmp_path / "run")) == 1
+
+
+@pytest.mark.slow
+def test_a_run_of_more_rows_takes_no_program_of_a_shorter_one(tmp_path: Path) -> None:
+    long = [*(word for word in TINY if word != "trials=3"), "explore.trials=41", "eval_episodes=0"]
+    for trials in (2, 41):  # of 25 rows: 41 have no room in 1024
+        done = call("train", *long, f"trials={trials}", f"out=of{trials}", cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path))
+        assert done.returncode == 0, done.stderr
+    done = call("train", "resume=of2", "trials=41", cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path))
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
 def test_the_policy_of_a_trial_is_evaluated(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for asked, trial in (("trial=1", 1), ("trial=best", store.best_trial(store.trials(whole)))):
         evaluate([str(whole), asked, "episodes=1", "json=true"])
