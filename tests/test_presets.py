@@ -229,6 +229,20 @@ def test_the_method_has_few_settings():
     assert [field.name for field in dataclasses.fields(Config)][-len(own) :] == own
 
 
+def test_a_setting_of_another_kind_of_network_is_refused():
+    # It would be accepted, and change nothing.
+    known = parse("task=cartpole model=log_normal model.log_z_min=-4 model.kl_weight=0.2").model
+    assert (known.log_z_min, known.kl_weight) == (-4.0, 0.2)
+    assert parse("task=cartpole model=concrete model.kl_weight=0.2").model.kl_weight == 0.2
+    for kind, dropout, word in (
+        ("binary", "binary", "model.log_z_min=-4"),
+        ("ensemble", "none", "model.kl_weight=0.2"),
+    ):
+        told = f"{word} changes nothing with model.dropout={dropout}; it needs model.dropout=log_normal"
+        with pytest.raises(ConfigError, match=re.escape(told)):
+            parse(f"task=cartpole model={kind} {word}")
+
+
 def test_a_need_is_told_from_none():
     assert "search.discount" not in needs() | settings()
     assert {"search.grad_clip", "fit.num_starts", "search.period.start", "model.hidden"} <= settings() & needs()

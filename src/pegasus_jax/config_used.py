@@ -9,6 +9,11 @@ from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import TASKS, Config, Explore, uses
 
 NEEDS = {"constraint_bound": "constraint", "data_columns": "data", "data_control": "data", "init_parts": "init"}
+# Setting -> another one, and its values with which it changes something.
+ONLY_WITH = {
+    "model.log_z_min": ("model.dropout", ("log_normal",)),
+    "model.kl_weight": ("model.dropout", ("log_normal", "concrete", "gaussian", "sparse")),  # what is learned
+}
 
 
 def check_config(config: Config) -> None:
@@ -33,6 +38,12 @@ def check_needed(config: Config, given: Mapping[str, Any]) -> None:
     for key, need in NEEDS.items():
         if key in given and not getattr(config, need):
             raise ConfigError(f"{key}={shown(given[key])} needs {need}=; expected both, or neither")
+    now = leaves(config)
+    for key, (other, values) in ONLY_WITH.items():
+        if key in given and now[other] not in values:
+            raise ConfigError(
+                f"{key}={shown(given[key])} changes nothing with {other}={now[other]}; it needs {other}={values[0]}"
+            )
 
 
 def used_by() -> dict[str, tuple[str, ...]]:
