@@ -22,6 +22,7 @@ import pytest
 import pegasus_jax as pg
 from folders import a_run
 from pegasus_jax.config import Explore, Sensors
+from pegasus_jax.task import Signal
 from probes import unchecked
 
 _counter = itertools.count()
@@ -650,6 +651,11 @@ WRONG_TASKS = [
     (dict(dt=None), r"the task's dt=null is no control period"),
     (dict(angles=(0, 0)), r"the task's angles=\[0,0\] names 0 twice; the nearest is \[0\]"),
     (dict(goal=lambda key: 1.0), r"the task's goal is of type function; expected Signal\(value, units\)"),
+    (
+        dict(goal=Signal(lambda key: jnp.zeros(3), (1.0,))),
+        r"the task's goal has values of shape \(3,\); expected \(1,\)",
+    ),
+    (dict(reference=Signal(lambda t: t, (1.0,))), r"the task's reference has values of shape \(\); expected \(1,\)"),
     (dict(start_mean=[float("nan"), 0.0]), r"the task's start_mean is \[nan, 0\.0\]; expected finite numbers"),
     (dict(control_high=[float("inf")]), r"the task's control_high is \[inf\]; expected finite numbers"),
     (

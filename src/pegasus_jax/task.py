@@ -3,6 +3,8 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -109,8 +111,16 @@ def checked(task: Task) -> Task:
     for name in ("goal", "reference"):
         if not isinstance(given := getattr(task, name), Signal | None):
             raise ConfigError(f"the task's {name} is of type {type(given).__name__}; expected Signal(value, units)")
+        if given is not None and (shape := _shape_of(name, given)) != (size := (len(given.units),)):
+            raise ConfigError(f"the task's {name} has values of shape {shape}; expected {size}, as many as its units")
     if not any(isinstance(limit, Tracer) for limit in (task.control_low, task.control_high)):
         for name, low, high in zip(task.control_names, task.control_low, task.control_high, strict=True):
             if not low < high:
                 raise ConfigError(f"the task's limits of {name} are {low:g} and {high:g}; expected control_low first")
     return task
+
+
+def _shape_of(name: str, signal: Signal) -> tuple[int, ...]:
+    """The shape of the values of a reference, a function of time, or of a goal, of a key."""
+    given = jnp.zeros(()) if name == "reference" else jax.random.key(0)
+    return jax.eval_shape(lambda x: jnp.asarray(signal.value(x)), given).shape
