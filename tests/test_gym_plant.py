@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 
 import gymnasium
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -22,12 +23,14 @@ from pegasus_jax import episode, interrupt, start, tasks
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
+from pegasus_jax.memory import past_controls
+from pegasus_jax.policies.driver import driver
 from pegasus_jax.runs import config_io, store
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.start import preset
 from pegasus_jax.task import Task
 from pegasus_jax.tasks import assumed
-from pegasus_jax.types import Cost
+from pegasus_jax.types import Cost, Policy
 from probes import TINY_WORDS, cart, tiny
 
 TINY = [*TINY_WORDS, "trials=2"]
@@ -424,6 +427,34 @@ def test_what_did_not_take_place_costs_what_the_user_says() -> None:
     state = jax.jit(exp.add_episode)(state, whole)
     assert int(state.data.size) == 3
     np.testing.assert_array_equal(state.data.x[:, 0], [0, 1, 2, *[0] * (len(state.data.x) - 3)])
+
+
+def test_nothing_is_compiled_while_a_robot_moves() -> None:
+    """In double precision too, and of a first controller that is JAX's: all of it is traced before the reset."""
+    traced: list[str] = []
+
+    def noted(name: str, u: Any) -> Any:
+        traced.append(name)
+        return u
+
+    with jax.enable_x64(True):
+        task = task_of("Terminates-v0", 1, horizon=6)
+        before: list[list[str]] = []
+        reset = task.environment.reset
+        task = task._replace(
+            environment=task.environment._replace(reset=lambda seed: (before.append([*traced]), reset(seed))[1]),
+            guide=jax.jit(lambda x: noted("guide", -x)),
+            memory=past_controls(("u",), np.zeros(1), 1, shown=True),
+        )
+        policy = Policy(
+            init=lambda key: jnp.ones(1),
+            sample=lambda key: jnp.zeros(1),
+            apply=lambda params, noise, seen: noted("policy", params * jnp.tanh(seen[:1] + seen[1:])),
+        )
+        drive = driver(task, policy, lambda key: jnp.zeros((6, 1)))
+        ran = [drive(jax.random.key(0), jnp.ones(1), exploring) for exploring in (True, False, True)]
+    assert [len(one.trajectory.u) for one in ran] == [3, 3, 3]
+    assert before[0] == traced == ["policy", "guide"]
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,7 @@
 """Episodes of a policy in JAX on an environment: what they ask of JAX is compiled before the robot moves."""
 
 from collections.abc import Callable
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -30,7 +30,8 @@ def driver(task: Task, policy: Policy, explore: Callable[[Key], Array]) -> Calla
 
     def reaction(params: Params, noise: Params, m: Any, x: Array) -> tuple[Array, Any]:
         u = policy.apply(params, noise, see(m, x))
-        return u, advance(m, x, u)
+        # In one type: a control in double precision would make this another program from the second period on.
+        return u, m if m is None else advance(m, x, u).astype(m.dtype)
 
     drawn, begin, react = jax.jit(draws), jax.jit(partial(recall.begin, task.memory)), jax.jit(reaction)
     costs_of = jax.jit(partial(episode.costs, task))
@@ -43,11 +44,19 @@ def driver(task: Task, policy: Policy, explore: Callable[[Key], Array]) -> Calla
         react(params, jax.tree.map(lambda z: z[0], noise), m, x[0])
         costs_of(episode.padded(Trajectory(x, u, u[:, 0], memory=m), task.horizon))
 
+    @cache
+    def wake() -> None:
+        """The first controller answers once before the robot waits for it: it may be JAX's, and compile."""
+        if task.guide is not None:
+            task.guide(np.asarray(task.start_mean, np.float32))
+
     def drive(key: Key, params: Params, exploring: bool) -> Episode:
         plan, begin_key, *others = drawn(key)
         plan, seed, noise = jax.tree.map(np.asarray, (plan, *others))
         params = jax.device_put(params)
         compile_all(params, noise, begin_key)
+        if exploring:
+            wake()
         first = m = None
         sent = recall.resting(task).astype(plan.dtype)
 
