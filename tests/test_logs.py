@@ -11,6 +11,7 @@ import pegasus_jax as pg
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.logs.columns import layout
+from pegasus_jax.logs.episodes import interpolated
 from pegasus_jax.logs.read import read
 from pegasus_jax.logs.table import Names, Table
 from pegasus_jax.math import circles
@@ -173,6 +174,21 @@ def test_an_angle_is_interpolated_over_its_seam(low, tmp_path):
     true = np.interp(np.arange(len(found[0].trajectory.x)), rows[:, 0], angle)
     off = found[0].trajectory.x[:, 0] - true
     np.testing.assert_allclose(np.abs(np.exp(1j * off) - 1), 0, atol=1e-5)
+
+
+def test_a_number_that_is_missing_in_an_angle_is_the_only_one():
+    """As in a bag, whose messages are brought to the rows' times before it is cut where something is missing."""
+    t, angle = np.arange(6.0), np.array([3.0, 3.1, -3.1, np.nan, -2.9, -2.8])
+    np.testing.assert_allclose(interpolated(t, t, angle, turning=True), angle, atol=1e-12)
+    between = interpolated(t + 0.5, t, angle, turning=True)
+    np.testing.assert_array_equal(np.isnan(between), [False, False, True, True, False, True])  # the last is outside
+
+
+def test_an_episode_of_one_control_is_one(tmp_path):
+    """As a robot's log that ends in its first period, whose time of the last observation nobody wrote."""
+    rows = dict(x=ROWS[:2, :2], u=ROWS[:1, 2:], time=np.zeros(1), dt=0.3, state_names=("x", "v"), control_names=("u",))
+    np.savez(tmp_path / "0001.npz", **rows)
+    same(transitions(CART, str(tmp_path / "0001.npz"))[0], ROWS[:2])
 
 
 @pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
@@ -473,6 +489,11 @@ def test_what_a_controller_remembers_goes_on_from_part_to_part(tmp_path):
     assert first.trajectory.memory is not None
     place = [i for i, name in enumerate(experiment.task.memory.names) if "force" in name]
     np.testing.assert_allclose(second.trajectory.memory[place], rows[24, 4:], atol=1e-5)
+    logged.save(tmp_path, [first, second], experiment.task)  # as another run reads what this one was given
+    again = read([str(tmp_path / "logged" / "*.npz")], experiment.task)[0]
+    for one, other in zip([first, second], again, strict=True):
+        np.testing.assert_allclose(other.trajectory.memory, one.trajectory.memory, atol=1e-6)
+        assert other.begins == one.begins
     state = jax.eval_shape(experiment.init, jax.random.key(0))
     for one in pg.load_logs(str(tmp_path / "a.csv"), experiment.task):
         state = jax.eval_shape(experiment.add_episode, state, one)

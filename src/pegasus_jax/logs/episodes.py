@@ -29,6 +29,7 @@ class Segment(NamedTuple):
     x: np.ndarray  # [L+1, D] states, as far as they are measured
     u: np.ndarray  # [L, U] what was sent at the times 0..L-1
     begins: bool = True  # whether its first row is its episode's
+    first: bool = False  # whether that is the first row of the table, as it is there
 
 
 def segments(table: Table, where: Layout, task: Task, control: str, note: Note) -> Iterator[Segment]:
@@ -63,7 +64,9 @@ def segments(table: Table, where: Layout, task: Task, control: str, note: Note) 
             for part in np.split(np.arange(len(rows)), cuts):
                 if len(part) > 1:
                     x = to_state(observed[rows][part], task.circles)
-                    yield Segment(t[rows][part], x, u[part[:-1]], begins=bool(part[0] == 0))
+                    first = bool(rows[part[0]] == 0)
+                    begun = bool(part[0] == 0) and (table.begins or not first)
+                    yield Segment(t[rows][part], x, u[part[:-1]], begun, first)
 
 
 def _cuts(
@@ -181,9 +184,11 @@ def interpolated(
 
     `turn` is a whole turn in the values' unit.
     """
-    straight = np.unwrap(values, period=turn) if turning else values
+    straight, there = values.astype(float), np.isfinite(values)
+    if turning:  # a number that is missing is on no side of a seam, and what follows it is
+        straight[there] = np.unwrap(values[there], period=turn)
     found = np.interp(grid, t, straight, left=np.nan, right=np.nan)
-    if np.array_equal(straight, values):
+    if np.array_equal(straight, values, equal_nan=True):
         return found
-    low = -turn / 2 if values.min() < 0 else 0.0
+    low = -turn / 2 if values[there].min() < 0 else 0.0
     return (found - low) % turn + low

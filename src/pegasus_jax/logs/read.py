@@ -72,19 +72,22 @@ def read(
         if not pieces:
             note("no two rows follow each other; left out")
         used = tuple(map(str, (*where.observation, *where.control)))
-        goal = {name: table.remembered[name] for name in goals if name in table.remembered}
+        told = {name: value for name, value in table.remembered.items() if name in task.memory.names}
+        goal = {name: told[name] for name in goals if name in told}
         if len(goal) < len(goals):
             note("it does not tell the goals of its episodes; one that is drawn stands for all")
-        whole = (one for piece in pieces if (one := periods(piece, task, note)) is not None)
-        found += [(one, table.source, used, goal) for one in whole]
+        for piece in pieces:
+            if (one := periods(piece, task, note)) is not None:
+                # What else was remembered is of that row, and counted in periods.
+                found.append((one, table.source, used, told if one.first else goal))
     if not found:
         raise ConfigError(
             f"data={','.join(files)} has no episode: no rows follow each other for a period, {task.dt:g} s"
         )
-    told = [
+    lines = [
         f"{own[0]}{f' and {len({*own}) - 1} more' if len({*own}) > 1 else ''}: {text}" for text, own in notes.items()
     ]
-    return _trajectories(found, task), told
+    return _trajectories(found, task), lines
 
 
 def tables(files: Sequence[str], names: Names, columns: Sequence[str], control: str) -> list[Table]:
@@ -116,7 +119,7 @@ def _table(path: Path, names: Names, columns: Sequence[str], control: str) -> Ta
 
 
 def _trajectories(found: Sequence[tuple[Segment, str, tuple[str, ...], dict[str, float]]], task: Task) -> list[Logged]:
-    """Parts of at most H periods, each with its costs and what is remembered at its start, its goal if it is known.
+    """Parts of at most H periods, each with its costs and what is remembered at its start, as far as it is known.
 
     Raises ConfigError where a cost is not a finite number.
     """
@@ -127,11 +130,11 @@ def _trajectories(found: Sequence[tuple[Segment, str, tuple[str, ...], dict[str,
     def known(whole: Trajectory) -> tuple[Array, Array | None]:
         return episode.costs(task, whole), recall.replay(task.memory, whole)
 
-    for one, source, columns, goal in found:
+    for one, source, columns, told in found:
         x, u, m = with_rates(one.x, task).astype(kind), one.u.astype(kind), None
-        if goal:
+        if told:
             m = np.array(recall.begin(task.memory, jax.random.key(0), jnp.asarray(x[0])))
-            m[[task.memory.names.index(name) for name in goal]] = [*goal.values()]
+            m[[task.memory.names.index(name) for name in told]] = [*told.values()]
         for i in range(0, len(u), size):
             rows = u[i : i + size]
             part = Trajectory(x[i : i + size + 1], rows, np.zeros(len(rows), kind), memory=m)  # type: ignore[arg-type]

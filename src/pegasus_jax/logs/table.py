@@ -32,6 +32,7 @@ class Table(NamedTuple):
     unit: str = "row"  # of the file that a row is
     texts: Texts = MappingProxyType({})  # (row, column) -> what is there instead of a number
     remembered: Mapping[str, float] = MappingProxyType({})  # name -> what was remembered where it begins, as a goal
+    begins: bool = True  # whether an episode begins with its first row
 
     def where(self, row: Any) -> str:
         """What to call a row."""
@@ -131,15 +132,18 @@ def of_arrays(source: str, arrays: Mapping[str, Any], names: Names) -> Table:
             own = [name] if array.ndim == 1 else [f"{name}.{i}" for i in range(parts.shape[1])]
             for column, numbers in zip(whole.get(name) or own, parts.T, strict=True):
                 columns.setdefault(column, np.append(numbers.astype(float), [np.nan] * (size - len(array))))
+    dt = float(np.ravel(arrays["dt"])[0]) if "dt" in arrays else None  # as in the episodes that we write
     for name in TIMES:  # of controls: the last observation comes a period after the last of them
-        if name in columns and size > 2 and np.isnan(columns[name][-1]):
-            columns[name][-1] = 2 * columns[name][-2] - columns[name][-3]
-    if "dt" in arrays and not {*TIMES} & {*columns}:  # as in the episodes that we write
-        columns["t"] = np.arange(size) * float(np.ravel(arrays["dt"])[0])
+        if name in columns and size > 1 and np.isnan(columns[name][-1]):
+            period = columns[name][-2] - columns[name][-3] if size > 2 else dt or np.nan
+            columns[name][-1] = columns[name][-2] + period
+    if dt is not None and not {*TIMES} & {*columns}:
+        columns["t"] = np.arange(size) * dt
     first = np.ravel(arrays.get("memory", ()))
     kept = dict(zip(map(str, np.ravel(arrays.get("memory_names", ()))), first, strict=False))
     rows = np.column_stack([*columns.values()])
-    return Table(source, tuple(columns), rows, np.arange(size), remembered=kept)
+    begins = bool(np.all(arrays.get("begins", True)))
+    return Table(source, tuple(columns), rows, np.arange(size), remembered=kept, begins=begins)
 
 
 def _own_names(arrays: Mapping[str, Any], found: Mapping[str, np.ndarray], names: Names) -> dict[str, list[str]]:

@@ -71,7 +71,7 @@ def save(run: Path, logged: Sequence[Logged], task: Task) -> None:
     for number, one in enumerate(logged, start=1):
         ended = "horizon" if len(one.trajectory.u) == task.horizon else "truncated"
         arrays = store.arrays_of(task.name, 1, one.trajectory, task, policy=0, ended=ended)
-        arrays |= {"source": one.source, "number": number, "of": len(logged)}
+        arrays |= {"source": one.source, "number": number, "of": len(logged), "begins": one.begins}
         write_whole(_path(run, number), lambda file, arrays=arrays: np.savez(file, **arrays))  # type: ignore[misc]
 
 
@@ -83,7 +83,9 @@ def load(run: Path) -> list[Logged]:
         if wrong := store.wrong(known, 1, task):
             raise RunError(f"{_path(run, number)} {wrong}")
         rows = (known[name] for name in ("x", "u", "cost"))
-        found.append(Logged(Trajectory(*rows, memory=known.get("memory")), str(known["source"])))  # type: ignore[arg-type]
+        begins = bool(known.get("begins", True))  # a run of an earlier version does not say it
+        episode: Any = Trajectory(*rows, memory=known.get("memory"))  # type: ignore[arg-type]
+        found.append(Logged(episode, str(known["source"]), begins=begins))
     return found
 
 
