@@ -26,7 +26,7 @@ from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.math.units import rate_of
 from pegasus_jax.models.smoothed import alternating, corrected, draw_rates
 from pegasus_jax.policies.rate_limited import rate_limited
-from pegasus_jax.runs import check, config_io, facts
+from pegasus_jax.runs import check, config_io, facts, store
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.start import preset
 from pegasus_jax.tasks.remembered import remembering, smoothed
@@ -288,6 +288,8 @@ def test_a_file_remembers_as_the_controller_does(sensor_run):
         assert said["history"]["controls"] == kept[name]
         assert said["control"][0].get("rate_per_s") == (20 if name == "slow" else None)
         assert (said["filter"] == "none") == (name not in ("difference", "filter"))
+        if said["filter"] != "none":  # of the angle where its cosine and its sine are observed
+            assert said["filter"]["rates_of"] == [store.task_of(run_of).state_names[i] for i in (0, 3)]
         assert ("memory" in said) == (format in ("onnx", "stablehlo"))
     assert np.ptp(expected) > 0.5
     zeros_begin_an_episode(run_of, rows[:3].astype(expected.dtype), expected)

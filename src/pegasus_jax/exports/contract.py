@@ -9,7 +9,7 @@ import numpy as np
 from pegasus_jax.exports.learned import Learned
 from pegasus_jax.exports.parity import Parity
 from pegasus_jax.math.units import parted
-from pegasus_jax.memory import resting
+from pegasus_jax.memory import measured, resting
 from pegasus_jax.runs.machine import about
 from pegasus_jax.tasks.remembered import kept_by
 
@@ -62,7 +62,11 @@ def _memory(learned: Learned) -> dict[str, Any]:
         return {"filter": "none", "history": "none"}
     kept = kept_by(learned.config, task)
     rest = resting(task).astype(float).tolist()
-    rates = {"rates_of": [*learned.sensors], "computed_by": "difference", "weight_of_the_newest": kept.weight}
+    rates = {
+        "rates_of": [task.state_names[i] for i in measured(task)],
+        "computed_by": "difference",
+        "weight_of_the_newest": kept.weight,
+    }
     return {
         "filter": rates if kept.rates else "none",
         "history": {"controls": kept.controls, "observations": kept.rows, "controls_before_an_episode": rest},
