@@ -69,7 +69,8 @@ def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.BES
             for place, (trajectory, drawn) in enumerate(played, start=1):
                 title = f"{task.name}, trial {number}, episode {place} of {episodes}"
                 if writer is None:
-                    writer = _writer(beside, rate=max(1, round(len(drawn) / (len(trajectory.u) * task.dt))))
+                    periods = len(trajectory.u) if task.environment is None else len(drawn) * between(task)
+                    writer = _writer(beside, rate=max(1, round(len(drawn) / (periods * task.dt))))
                 for picture in composed(drawn, strip(trajectory, task, title)):
                     writer.append_data(picture)
         finally:
@@ -95,12 +96,17 @@ def driven(config: Config, params: Params, seeds: range) -> Iterator[tuple[Traje
     Raises ConfigError for an environment that does not render, RunError where an episode, or its rendering, failed.
     """
     task, look, drawn = tasks.of_config(config), tasks.camera(config), list[np.ndarray]()
-    watched = task._replace(environment=filmed(task.environment, look, max(1, round(EVERY / task.dt)), drawn))
+    watched = task._replace(environment=filmed(task.environment, look, between(task), drawn))
     drive: Any = assembled(config, watched, None, 0).drive
     for seed in seeds:
         ran = drive(jax.random.key(seed), params, False)
         failed(ran, task, kept=False)
         yield ran.trajectory, [*drawn] or [fitted(look())]
+
+
+def between(task: Task) -> int:
+    """Control periods of an environment from one picture to the next."""
+    return max(1, round(EVERY / task.dt))
 
 
 def filmed(environment: Any, look: Callable[[], np.ndarray], every: int, drawn: list[np.ndarray]) -> Any:
