@@ -20,7 +20,7 @@ from pegasus_jax.runs.beside import beside
 from pegasus_jax.runs.display import Display
 from pegasus_jax.runs.job import Job, first_states
 from pegasus_jax.runs.programs import Program
-from pegasus_jax.runs.study import curves, one_json, rounded
+from pegasus_jax.runs.study import ROUNDED, curves, one_json, rounded
 from pegasus_jax.runs.train import learn
 from pegasus_jax.runs.writers import Writer
 from pegasus_jax.types import RunState, Trajectory
@@ -85,6 +85,14 @@ def test_a_study_keeps_the_number_of_networks_that_it_was_made_with() -> None:
     eight = cart()._replace(state_names=tuple("abcdefgh"))
     kept = curves(config, SEEDS, [], eight)["config"]
     assert (kept["model.ensemble_size"], kept["model.kl_weight"]) == (5, 1.0)
+
+
+def test_a_study_says_how_long_its_episodes_were() -> None:
+    """Those of seeds that stopped early are shorter; the curves have one time for all."""
+    row = dict.fromkeys((*ROUNDED, "success_rate"), 0.5) | {"skipped_updates": 0}
+    ends = [(0.2, 2.0), (0.5, 4.0)]  # [s] of plant time after each trial, of two seeds
+    trials = [[row | {"plant_seconds": seconds} for seconds in seeds] for seeds in ends]
+    assert curves(CONFIG, SEEDS, trials, cart())["plant_seconds"] == [1.1, 2.25]
 
 
 def test_the_loop_learns_what_the_whole_run_as_one_program_learns(job: Job, unwritten: RunState) -> None:
