@@ -26,10 +26,10 @@ from pegasus_jax.imagine.scenarios import Sampler
 from pegasus_jax.learn.schedule import search_table
 from pegasus_jax.learn.search import Problem, searcher
 from pegasus_jax.runs import config_io, first, store
+from pegasus_jax.runs.best import best_trial
 from pegasus_jax.runs.check import before_training
 from pegasus_jax.runs.display import limits as told
 from pegasus_jax.runs.display import limits_line
-from pegasus_jax.runs.store import best_trial
 from pegasus_jax.types import Prediction, TrainState
 from pegasus_jax.vectorized import for_particles
 from probes import cart, network, same, tiny, unchecked

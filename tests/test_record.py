@@ -15,7 +15,7 @@ from folders import a_run, episode, row
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli.runs import paths_and
 from pegasus_jax.runs import display, files, store
-from pegasus_jax.runs.store import best_trial
+from pegasus_jax.runs.best import best_trial, judging
 
 
 @pytest.fixture(scope="module")
@@ -279,6 +279,21 @@ def other_cost(rows: list[dict[str, Any]], since: int) -> list[dict[str, Any]]:
 )
 def test_the_best_policy(rows: list[dict[str, Any]], last: dict[str, Any] | None, best: int) -> None:
     assert best_trial(rows, last) == best
+
+
+@pytest.mark.parametrize(
+    ("rows", "policy", "costs"),
+    [
+        (ran((0, 0.9, "horizon"), (1, 0.2, "horizon"), (1, 0.7, "error")), 1, [0.2]),
+        (other_cost(ran((0, 0.9, "horizon"), (1, 5.0, "horizon"), (1, 0.2, "horizon")), 3), 1, [0.2]),
+        ([one | {"random": one["trial"] == 1} for one in ran((0, 1.0, "horizon"), (0, 0.1, "horizon"))], 0, [0.1]),
+    ],
+)
+def test_a_policys_cost_is_that_of_the_episodes_that_judge_it(rows, policy, costs) -> None:
+    """Not one that a fault cut short, of another cost, or of random controls."""
+    assert [one["episode_cost"] for one in judging(rows, policy)] == costs
+    told = display.best_line([one | {"objective_fresh": 0.3} for one in rows], policy)
+    assert told.startswith(f"best policy: trial {policy} (cost {costs[0]:.3f}, ran in 1 episode)")
 
 
 def test_logs_are_no_episode_of_the_policy_of_before() -> None:

@@ -17,6 +17,7 @@ import forked
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli.runs import evaluate
 from pegasus_jax.runs import checkpoint, config_io, store
+from pegasus_jax.runs.best import best_trial
 from pegasus_jax.runs.restore import restored
 
 # A run of seconds: the model that compiles soonest, the smallest networks and searches that go through every part.
@@ -270,7 +271,7 @@ def test_a_run_of_more_rows_takes_no_program_of_a_shorter_one(tmp_path: Path) ->
 
 @pytest.mark.slow
 def test_the_policy_of_a_trial_is_evaluated(whole: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for asked, trial in (("trial=1", 1), ("trial=best", store.best_trial(store.trials(whole)))):
+    for asked, trial in (("trial=1", 1), ("trial=best", best_trial(store.trials(whole)))):
         evaluate([str(whole), asked, "episodes=1", "json=true"])
         assert json.loads(capsys.readouterr().out)["trial"] == trial
     for asked, says in (

@@ -12,7 +12,6 @@ import imageio.v3 as iio
 
 from pegasus_jax.checks import shown
 from pegasus_jax.config import label, model_word
-from pegasus_jax.episode import mean_cost
 from pegasus_jax.report import driven, read
 from pegasus_jax.report.curves import calibration, learning, trials
 from pegasus_jax.report.findings import findings, said
@@ -20,7 +19,8 @@ from pegasus_jax.report.page import Section, data, downloads, facts, fold, table
 from pegasus_jax.report.read import Look, model_of
 from pegasus_jax.report.tables import trajectories_csv, trials_csv
 from pegasus_jax.report.trajectories import fans, summary
-from pegasus_jax.runs import store
+from pegasus_jax.runs import restore, store
+from pegasus_jax.runs.best import judging
 from pegasus_jax.runs.display import duration
 from pegasus_jax.tasks import guide
 
@@ -85,8 +85,7 @@ def best(found: Look) -> str:
     if found.best is None:
         return "not known"
     row = found.rows[found.best - 1] if found.best else {}
-    steps = [step.real for step in found.steps if step.real and step.policy == found.best]
-    own = [mean_cost(ran, found.task) for ran in steps if len(ran.trajectory.cost)]
+    own = [one["episode_cost"] for one in judging(restore.with_last(found.path, found.rows), found.best)]
     ran = [one for one in found.driven if one.policy == found.best]
     known = []
     if row.get("mean_cost") is not None:

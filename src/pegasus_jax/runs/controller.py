@@ -129,7 +129,7 @@ def _numbers(values: ArrayLike, size: int, what: str, kind: type) -> np.ndarray:
 
 @brief
 def controller(run: str | Path, trial: restore.Trial = restore.BEST) -> Controller:
-    """The policy of a run after a trial, finished run or not: a number, "last", or "best" (`record.best_trial`).
+    """The policy of a run after a trial, finished run or not: a number, "last", or "best" (`best.best_trial`).
 
     Of a policy with noise on its units it is the mean, every unit at its expected size. It is compiled here, so that
     the first call takes no longer than the others. Only the run's folder is read: no environment is opened, no model's

@@ -16,7 +16,7 @@ from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn
 
 from pegasus_jax.config import Config, label, model_word
-from pegasus_jax.runs.store import ran_first
+from pegasus_jax.runs.best import judging
 from pegasus_jax.runs.trials_table import BLOCKS, PLAIN, best, count_solved, curves, solved, table
 from pegasus_jax.shell import typed
 
@@ -344,7 +344,7 @@ def best_line(rows: Sequence[dict[str, Any]], trial: int) -> str:
     if all(row["objective_fresh"] is None for row in rows):
         return "no policy was learned: every episode explored"
     row = rows[trial - 1] if trial else {"mean_cost": None}  # 0: the policy that the first episode ran
-    own = [other["episode_cost"] for other in rows if other.get("policy") == trial and (trial or ran_first(other))]
+    own = [other["episode_cost"] for other in judging(rows, trial)]
     if row["mean_cost"] is not None:
         return f"best policy: trial {trial} (success {row['success_rate']:.0%}, cost {row['mean_cost']:.3f})"
     known = f"cost {np.mean(own):.3f}, ran in {len(own)} episode{'s' * (len(own) > 1)}" if own else "not run yet"

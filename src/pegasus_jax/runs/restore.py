@@ -24,6 +24,7 @@ from pegasus_jax.config import Config, Lagrangian
 from pegasus_jax.episode import verdict
 from pegasus_jax.experiment import Experiment
 from pegasus_jax.runs import checkpoint, config_io, facts, logged, store
+from pegasus_jax.runs.best import best_trial
 from pegasus_jax.runs.display import best_line
 from pegasus_jax.task import Task
 from pegasus_jax.types import RunState, TrainState
@@ -33,7 +34,7 @@ LAST, BEST = "last", "best"
 
 
 def restored(run: Path, trial: Trial = LAST, task: Task | None = None) -> tuple[Config, Experiment, RunState]:
-    """A run's config, its experiment, and its state after a trial: a number, "last" or "best" (`record.best_trial`).
+    """A run's config, its experiment, and its state after a trial: a number, "last" or "best" (`best.best_trial`).
 
     The experiment is that of `task`: of the facts in the folder where that is None, without a plant or a cost. No
     global setting of JAX is changed. Raises RunError when there is no such trial, or none yet that can be read.
@@ -92,9 +93,15 @@ def best(run: Path) -> int:
         rows.pop()
     last = _episode_after(run, rows)
     try:
-        return store.best_trial(rows, last, first=0 if 0 in there else 1)
+        return best_trial(rows, last, first=0 if 0 in there else 1)
     except (KeyError, TypeError) as error:
         raise RunError(f"{run / 'trials.jsonl'} has rows that this version cannot judge") from error
+
+
+def with_last(run: Path, rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of a run's trials, and what one would say of the episode that has none yet."""
+    last = _episode_after(run, rows)
+    return [*rows, *([last] if last else [])]
 
 
 def _episode_after(run: Path, rows: Sequence[dict[str, Any]]) -> dict[str, Any] | None:
@@ -105,15 +112,14 @@ def _episode_after(run: Path, rows: Sequence[dict[str, Any]]) -> dict[str, Any] 
         return None
     learned = {"objective_fresh": None, "mean_cost": None}
     told = {"policy": origin[0], "random": rows[-1]["random"], "ended": ran.ended}
+    told["cost_since"] = store.cost_since(rows[-1])
     return learned | told | verdict(ran, store.task_of(run))
 
 
 def chosen(run: Path, trial: Trial, number: int) -> str:
     """Which policy a command uses that was asked for `trial`, and why, in one line; `number` is its trial."""
     if trial == BEST:
-        rows = store.trials(run)
-        last = _episode_after(run, rows)
-        return best_line([*rows, *([last] if last else [])], number)
+        return best_line(with_last(run, store.trials(run)), number)
     return f"newest policy: trial {number}" if trial == LAST else f"policy of trial {number}, as asked"
 
 

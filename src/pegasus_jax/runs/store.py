@@ -312,37 +312,6 @@ def write_trials(run: Path, rows: list[dict[str, Any]]) -> None:
     write_whole(run / "trials.jsonl", lambda file: file.write(text.encode()))
 
 
-def best_trial(rows: list[dict[str, Any]], last_episode: dict[str, Any] | None = None, first: int = 1) -> int:
-    """The trial after which the best policy was learned, judged by the rows of trials.jsonl, of which there is one.
-
-    Where every policy was evaluated, that with the highest success rate, and of these with the lowest mean cost. Else
-    by its own episodes on the plant: that of which most succeeded, of these the one that broke a constraint least
-    often, and of these the one with the lowest mean cost;
-    `last_episode` is one more than there are rows. What a fault or a person cut short does not count. A policy that
-    never ran is chosen only where none ran: the last one. Among equals it is the latest. With `first` 0 one that was
-    learned before the first episode is among them. Costs are compared with costs of the same function only: the newest.
-    """
-    from pegasus_jax.episode import CUT
-
-    rows = [row for row in rows if cost_since(row) == cost_since(rows[-1])]
-    if all(row["mean_cost"] is not None and row["success_rate"] is not None for row in rows):
-        return max(rows, key=lambda row: (row["success_rate"], -row["mean_cost"], row["trial"]))["trial"]
-    own: dict[int, list[tuple[float, ...]]] = {}  # of each policy, (failed, broke the constraint, cost) of its episodes
-    for row in [*rows, *([last_episode] if last_episode else [])]:
-        learned = row["policy"] or (first == 0 and ran_first(row))
-        if learned and row["episode_cost"] is not None and row["ended"] not in CUT:
-            broke = float(row.get("constraint_broken", False))
-            own.setdefault(row["policy"], []).append((1.0 - row["episode_success"], broke, row["episode_cost"]))
-    if not own:
-        return rows[-1]["trial"]
-    return min(own, key=lambda policy: (*np.mean(own[policy], 0), -policy))
-
-
-def ran_first(row: dict[str, Any]) -> bool:
-    """Whether a row's episode was of the policy that there was before the first trial: logs are of none."""
-    return row["policy"] == 0 and not row["random"] and "logs" not in row
-
-
 def cost_since(row: dict[str, Any]) -> int:
     """The first trial whose costs are of the same function as those of a row of trials.jsonl."""
     return row.get("cost_since", 1)

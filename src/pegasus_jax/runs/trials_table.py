@@ -10,6 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from pegasus_jax.runs import store
+from pegasus_jax.runs.best import best_trial
 
 Rows = Sequence[dict[str, Any]]  # of one trial, a row of trials.jsonl for each seed
 BLOCKS, PLAIN = "▁▂▃▄▅▆▇█", "_.-=+*%#"  # of a curve, on terminals that have them and on others
@@ -65,12 +66,12 @@ def spark(values: Sequence[Any], blocks: str = BLOCKS) -> str:
 
 
 def best(trials: Sequence[Rows], first: int) -> int | None:
-    """The trial with the best policy of a single seed so far, `first` as in `store.best_trial`.
+    """The trial with the best policy of a single seed so far, `first` as in `best_trial`.
 
     None where rows of an earlier version do not tell.
     """
     try:
-        return store.best_trial([rows[0] for rows in trials], first=first)
+        return best_trial([rows[0] for rows in trials], first=first)
     except (KeyError, TypeError):
         return None
 
