@@ -176,7 +176,7 @@ def test_every_command_takes_the_best_policy(
 
 
 def test_nothing_is_imported_from_inside_a_run(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Neither by the name of a folder below the working folder, nor through a path, nor from there."""
+    """Neither by the name of a folder below the working folder, nor through a link or a path, nor from there."""
     for folder in (run, run / "lib"):
         folder.mkdir(exist_ok=True)
         (folder / "evil.py").write_text("raise SystemExit('executed')")
@@ -184,6 +184,9 @@ def test_nothing_is_imported_from_inside_a_run(run: Path, monkeypatch: pytest.Mo
     monkeypatch.chdir(run.parent)
     with pytest.raises(RunError, match="nothing is imported from there"):
         restore.announce(Path("run"), config)
+    (run.parent / "link.py").symlink_to(run / "evil.py")
+    with pytest.raises(RunError, match="nothing is imported from there"):
+        restore.announce(run, config_io.override(config, {"cost": "link:cost"}))
     config = config_io.override(config, {"cost": "evil:cost"})
     restore.announce(run, config)
     monkeypatch.syspath_prepend(run / "lib")

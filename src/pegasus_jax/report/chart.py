@@ -76,7 +76,6 @@ def chart(
     y: tuple[float, float] | None = None,
     log: bool = False,
     small: bool = False,
-    note: str = "",
 ) -> str:
     """A figure with its axes' names and units, a legend and a caption. `x` and `y` are limits.
 
@@ -91,7 +90,7 @@ def chart(
         f'<clipPath id="{clip}"><rect x="{LEFT}" y="{TOP - 5}" width="{inner[0] + 6}" height="{inner[1] + 10}"/>'
         f'</clipPath>{_grid(axes, across, up)}<g clip-path="url(#{clip})">{drawn}</g></svg>'
     )
-    words = f"<figcaption><b>{escape(title)}</b>{' ' + escape(note) if note else ''}</figcaption>"
+    words = f"<figcaption><b>{escape(title)}</b></figcaption>"
     return f'<figure class="{"small" if small else "wide"}">{words}{svg}{"" if small else legend(marks)}</figure>'
 
 

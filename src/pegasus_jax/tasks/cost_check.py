@@ -195,14 +195,14 @@ def _number(value: Any, cost: Callable[[Any], Any], what: str) -> None:
         raise ConfigError(f"{what} returns {kind}{_at(cost)}")
 
 
-def beyond(traced: Any, given: Sequence[Any] = ()) -> list[tuple[int, int, str | None]]:
+def beyond(traced: Any) -> list[tuple[int, int, str | None]]:
     """(index, length, file.py:line) of each read beyond an array's end, by an index that the inputs do not change.
 
     JAX does not refuse these: it takes the nearest entry, or NaN. Indices are followed through the program's integers.
     """
     consts = [None if isinstance(value, Tracer) else value for value in traced.consts]  # of a trace around this one
     with jax.ensure_compile_time_eval():
-        return _walk(traced.jaxpr, consts, list(given) or [None] * len(traced.jaxpr.invars))[0]
+        return _walk(traced.jaxpr, consts, [None] * len(traced.jaxpr.invars))[0]
 
 
 def _walk(jaxpr: Any, consts: Sequence[Any], given: Sequence[Any]) -> tuple[list[Any], list[Any]]:

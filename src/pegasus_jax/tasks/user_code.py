@@ -22,11 +22,10 @@ LIBRARIES = {"jax", "jaxlib", "numpy", "gymnasium", "flax", "optax", "pegasus_ja
 LONGEST = 300  # characters of somebody else's message
 
 
-def load(setting: str, name: str | Callable[..., Any], not_from: Path | None = None) -> Callable[..., Any]:
+def load(setting: str, name: str | Callable[..., Any]) -> Callable[..., Any]:
     """The function `module:function` that a setting names, also of a module in the working folder; or is, from Python.
 
-    Raises ConfigError, in one line with the user's file and line, where it cannot be had; with `not_from`, a run's
-    folder, also where the module lies in it: looking at a run must not run what came with it.
+    Raises ConfigError, in one line with the user's file and line, where it cannot be had.
     """
     if not isinstance(name, str):
         return name
@@ -40,7 +39,7 @@ def load(setting: str, name: str | Callable[..., Any], not_from: Path | None = N
         )
     if not (module and function) or module.startswith("."):
         raise ConfigError(f"{what} cannot be imported: expected {setting}=module:function, as in {setting}=robot:cost")
-    found = importing(what, module, not_from)
+    found = importing(what, module)
     with blamed(what):
         value = getattr(found, function, None)
     if value is None:
@@ -52,10 +51,10 @@ def load(setting: str, name: str | Callable[..., Any], not_from: Path | None = N
     return value
 
 
-def importing(what: str, module: str, not_from: Path | None = None) -> ModuleType:
+def importing(what: str, module: str) -> ModuleType:
     """The module of that name, imported. Raises ConfigError that begins with `what`; see `load`."""
     here = os.getcwd()
-    if here not in sys.path and not (not_from and _within(Path(here), not_from)):
+    if here not in sys.path:
         sys.path.append(here)
     parts = module.split(".")
     if parts[0] not in sys.modules and importlib.util.find_spec(parts[0]) is None:
@@ -65,11 +64,6 @@ def importing(what: str, module: str, not_from: Path | None = None) -> ModuleTyp
     for count in range(1, len(parts) + 1):  # from the outside in: to find a module imports those that hold it
         part = ".".join(parts[:count])
         place = origin(part, what)
-        if not_from and any(_within(path, not_from) for path in _places(part, what)):
-            raise ConfigError(
-                f"{what} cannot be imported from {place or part}: it lies in the run's folder, whose code is not run;"
-                " start the command where your own is"
-            )
         own = Path(here, f"{part}.py")
         if count == 1 and own.is_file() and place and own.resolve() != place.resolve():
             raise ConfigError(f"{what} cannot be imported: {part} is {place}, not your {own.name}; rename that file")
@@ -178,7 +172,3 @@ def _users(file: str) -> bool:
 
 def _ours(path: Path) -> bool:
     return path.is_relative_to(Path(__file__).parents[1]) or "pegasus_envs" in path.parts
-
-
-def _within(path: Path, folder: Path) -> bool:
-    return path.resolve().is_relative_to(folder.resolve())
