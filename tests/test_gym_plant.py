@@ -91,7 +91,7 @@ def task_of(env: str, states: int, horizon: int = 9, low: float = -2.0, high: fl
     return cart(horizon)._replace(
         name=env,
         plant=None,
-        environment=env_plant(env, (), states),
+        environment=env_plant(env, (), states, 1),
         cost=Cost(lambda x: x[0] ** 2, widen=lambda factor: Cost(lambda x: (x[0] / factor) ** 2)),
         state_names=tuple(f"x{i}" for i in range(states)),
         start_mean=np.zeros(states),
@@ -184,7 +184,11 @@ class Whole(Base):
     action_space = gymnasium.spaces.Box(-5, 5, (1,), np.int32)
 
 
-CLASSES = (Terminates, Truncates, Breaks, Swallows, Buffer, Whole)
+class Two(Base):
+    action_space = gymnasium.spaces.Box(-1, 1, (2,))
+
+
+CLASSES = (Terminates, Truncates, Breaks, Swallows, Buffer, Whole, Two)
 for made in CLASSES:
     gymnasium.register(f"{made.__name__}-v0", made)
 
@@ -197,6 +201,14 @@ def test_an_end_ends_the_episode_and_no_row_is_invented(made: type, ended: str) 
         assert (ran.ended, ran.error) == (ended, None)
         np.testing.assert_array_equal(ran.trajectory.x[:, 0], [0, 1, 2, 3])
         assert ran.trajectory.u.shape == (3, 1)
+
+
+def test_an_environment_of_another_number_of_controls_gets_none() -> None:
+    """As one that was changed after its policy was learned: NumPy would send one control to every motor."""
+    Base.sent.clear()
+    ran = episode.drive(0, lambda t, x: np.ones(1), task_of("Two-v0", 1))
+    assert (ran.ended, str(ran.error)) == ("error", "its action_space has shape (2,); expected (1,)")
+    assert not Base.sent
 
 
 def test_a_time_limit_that_is_the_horizon_ends_nothing_early() -> None:

@@ -206,15 +206,20 @@ def own_period(env: Any) -> float | None:
     return float(dt)
 
 
-def env_plant(name: str, arguments: tuple[str, ...], states: int, names: tuple[str, ...] = ()) -> EnvPlant:
-    """The environment of so many observations, maybe with names, opened when its first episode begins.
+def env_plant(
+    name: str, arguments: tuple[str, ...], states: int, controls: int, names: tuple[str, ...] = ()
+) -> EnvPlant:
+    """The environment of so many observations, maybe with names, and controls, opened when its first episode begins.
 
     An observation that is not finite, or not of that length, is refused at once: no control follows from it, and no
     data. Controls are the environment's own copy, of its action space's dtype and limits; whole numbers are rounded.
     """
 
     def reset(seed: int) -> np.ndarray:
-        return observed(first(make_env(name, arguments).reset(seed=seed)), states, names)
+        env = make_env(name, arguments)
+        if (shape := env.action_space.shape) != (controls,):  # as of another version: one control would go to all
+            raise ValueError(f"its action_space has shape {shape}; expected ({controls},)")
+        return observed(first(env.reset(seed=seed)), states, names)
 
     def step(control: np.ndarray) -> tuple[np.ndarray, np.ndarray, str]:
         env = make_env(name, arguments)

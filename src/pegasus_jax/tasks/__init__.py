@@ -175,7 +175,7 @@ def from_gym(config: Config) -> Task:
     task = _of_users(config, name, None, about, about.horizon, states, controls)
     task = task._replace(
         rates=_entries("rates", config.rates, name, len(states)),
-        environment=env_plant(name, config.env_args, len(states), about.state_names),
+        environment=env_plant(name, config.env_args, len(states), len(controls), about.state_names),
         starts=about.starts if len(about.starts) else None,
     )
     return circled.start_moments(circled.of_angles(*sensed.chosen(task, config.sensors, config.circles or ())))
