@@ -2,10 +2,10 @@
 
 import itertools
 import shlex
+import signal
 import string
 import subprocess
 import sys
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from benchmarks import once
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.cli.sweep import check, handle, jobs_of, values
+from pegasus_jax.cli import sweep as cli_sweep
+from pegasus_jax.cli.sweep import Job, check, handle, jobs_of, values
 from pegasus_jax.runs import config_io, store
 from test_train import TINY
 
@@ -115,12 +116,14 @@ def beyond(x: Any) -> Any:
         (["resume=runs/demo"], "resume is not a setting"),
         (["jobs=0"], "jobs=0 is out of range"),
         (["launcher=slrm"], "did you mean 'slurm'"),
+        (["out="], "out= names no folder; for example out=runs/sweep"),
+        (["seed=0-2", "seeds=2"], "seeds=2 of each of seed=0-2 would learn some twice; give one of them"),
         (["launcher=slurm"], "launcher="),  # neither the extra nor SLURM, or only one of them
     ],
 )
 def test_what_cannot_be_is_said_before_anything_starts(words: list[str], message: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=message) as said:
-        handle(["task=cartpole", *words, f"out={tmp_path / 'sweep'}"])
+        handle(["task=cartpole", f"out={tmp_path / 'sweep'}", *words])
     assert "\n" not in str(said.value)
     assert not list(tmp_path.rglob("config.yaml"))
 
@@ -142,7 +145,6 @@ def test_printed_commands_are_those_of_the_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.campaign
-@pytest.mark.skipif(find_spec("submitit") is None, reason="the extra `sweep` is not installed")
 def test_a_sweep_on_this_machine_leaves_ordinary_runs(tmp_path: Path) -> None:
     done = call(*once(*TINY, "trials=1"), "seed=1,2", "jobs=1", "launcher=local", "out=sweep", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
@@ -151,3 +153,22 @@ def test_a_sweep_on_this_machine_leaves_ordinary_runs(tmp_path: Path) -> None:
         run = tmp_path / "sweep" / f"seed{seed}"
         assert [row["trial"] for row in store.trials(run)] == [1]
         assert config_io.load(run / "config.yaml").seed == seed
+
+
+def test_the_runs_of_a_sweep_end_with_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begun = []
+
+    class Popen(subprocess.Popen):
+        def __init__(self, *given: Any, **more: Any) -> None:
+            super().__init__(*given, **more)
+            begun.append(self)
+
+    def stop(_: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli_sweep, "PROGRAM", [sys.executable, "-c", "import time; time.sleep(60)"])
+    monkeypatch.setattr(cli_sweep.subprocess, "Popen", Popen)
+    monkeypatch.setattr(cli_sweep.time, "sleep", stop)
+    with pytest.raises(KeyboardInterrupt):
+        cli_sweep.local([Job(tmp_path / name, []) for name in "abc"], 2, tmp_path, {})
+    assert [one.returncode for one in begun] == [-signal.SIGTERM, -signal.SIGTERM]

@@ -2,8 +2,8 @@
 
 import itertools
 import math
-import os
 import re
+import subprocess
 import sys
 import time
 from collections import Counter
@@ -32,10 +32,10 @@ OUT/SETTING-VALUE_.../seedN, and is checked before the first one starts.
            slurm        hand them to SLURM as one job array, jobs= at a time, and return
   jobs=2                how many run at once
   out=runs/sweep        the folder of all runs; OUT/jobs has what local and slurm jobs printed
-  seeds=, mesh=, track= of each pegasus-train; several trackers in brackets
+  seeds=, mesh=, track=, final= of each pegasus-train; several trackers in brackets
   slurm.KEY=VALUE       any option of sbatch: slurm.partition=gpu slurm.time=120 slurm.gpus_per_node=1
 
-local and slurm need the extra `sweep`: pip install 'pegasus-jax[sweep]'. All else is as in pegasus-train --help=all.
+slurm needs the extra `sweep`: pip install 'pegasus-jax[sweep]'. All else is as in pegasus-train --help=all.
 
 examples
   pegasus-sweep task=cartpole search.grad_clip=1,10,100 seed=0-2
@@ -44,12 +44,11 @@ examples
   pegasus-report runs/sweep     all of its runs side by side
 """
 
-OF_TRAIN = ("seeds", "mesh", "track")  # options of pegasus-train
+OF_TRAIN = ("seeds", "mesh", "track", "final")  # options of pegasus-train
 OPTIONS = (*MORE["pegasus-sweep"], "out", *OF_TRAIN)
 LONG = 60  # letters of a value in a folder's name
 LONGEST = 255  # bytes that file systems let a folder's name have
 MOST = 10_000  # runs of a sweep: beyond is a slip of the keyboard
-YEAR = 365 * 24 * 60  # [min]
 PROGRAM = [sys.executable, "-c", "from pegasus_jax.cli.main import train; train()"]  # pegasus-train, wherever that is
 
 
@@ -161,30 +160,44 @@ def show(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) 
 
 
 def local(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) -> None:
-    """Run the jobs as processes of this machine. Raises RunError when any failed."""
+    """Run the jobs as processes of this machine, which end with this one. Raises RunError when any failed."""
     from pegasus_jax.checks import RunError
 
     del options
-    executor = _executor("local", out)
-    executor.update_parameters(timeout_min=YEAR)  # submitit would end a job after two minutes
-    running: dict[Any, Path] = {}
+    (home := out / "jobs").mkdir(parents=True, exist_ok=True)
+    running: dict[subprocess.Popen, tuple[Path, Path]] = {}  # -> its run, and what it prints
     failed: list[Path] = []
-    for job in [*jobs, None]:  # in the end wait for the last ones
-        while len(running) >= at_once or (job is None and running):
-            for submitted in [one for one in running if one.done()]:
-                run = running.pop(submitted)
-                failed += [] if submitted.exception() is None else [run]
-                print(f"{'failed' if run in failed else 'done'}: {run} ({submitted.paths.stdout})", flush=True)
-            time.sleep(0.2)
-        if job is not None:
-            running[executor.submit(_command(job, dict(os.environ)))] = job.run  # submitit's own hides every GPU
+    try:
+        for number, job in enumerate([*jobs, None], start=1):  # in the end wait for the last ones
+            while len(running) >= at_once or (job is None and running):
+                for process in [one for one in running if one.poll() is not None]:
+                    run, log = running.pop(process)
+                    failed += [run] if process.returncode else []
+                    print(f"{'failed' if run in failed else 'done'}: {run} ({log})", flush=True)
+                time.sleep(0.2)
+            if job is not None:
+                log = home / f"{number:04d}.log"
+                with log.open("wb") as printed:
+                    begun = subprocess.Popen(
+                        [*PROGRAM, *job.words],
+                        stdin=subprocess.DEVNULL,
+                        stdout=printed,
+                        stderr=subprocess.STDOUT,
+                        start_new_session=True,  # a Ctrl-C is told to them once, below
+                    )
+                running[begun] = job.run, log
+    finally:
+        for process in running:
+            process.terminate()
+        for process in running:
+            process.wait()
     if failed:
         raise RunError(f"{len(failed)} of {len(jobs)} runs failed, the first {failed[0]}; see {out / 'jobs'}")
 
 
 def slurm(jobs: Sequence[Job], at_once: int, out: Path, options: dict[str, Any]) -> None:
     """Submit the jobs as an array. Raises ConfigError where there is no SLURM, or for an option it lacks."""
-    executor = _executor("slurm", out)
+    executor = _executor(out)
     try:
         executor.update_parameters(slurm_array_parallelism=at_once, **options)
     except (NameError, TypeError, ValueError) as error:
@@ -211,6 +224,8 @@ def handle(words: Sequence[str]) -> None:
     if launcher not in LAUNCHERS:
         raise ConfigError(f"launcher={launcher} is unknown; {did_you_mean(launcher, LAUNCHERS)}")
     at_once = whole("jobs", options.get("jobs", "2"))
+    if options.get("out") == "":
+        raise ConfigError("out= names no folder; for example out=runs/sweep")
     out = Path(options.get("out", "runs/sweep"))
     of_slurm = {f"slurm_{key[6:]}": value for key, value in rest.items() if key.startswith("slurm.")}
     if of_slurm and launcher != "slurm":
@@ -218,29 +233,32 @@ def handle(words: Sequence[str]) -> None:
             f"{next(iter(of_slurm)).replace('_', '.', 1)}= is of no use with launcher={launcher}; launcher=slurm"
         )
     own = {key: value for key, value in rest.items() if not key.startswith("slurm.")}
-    whole("seeds", options.get("seeds", "1"))
+    if whole("seeds", options.get("seeds", "1")) > 1 and len(values(own.get("seed", "0"))) > 1:
+        raise ConfigError(
+            f"seeds={options['seeds']} of each of seed={own['seed']} would learn some twice; give one of them"
+        )
     jobs = jobs_of(own | {key: options[key] for key in OF_TRAIN if key in options}, out)
     for job in jobs:
         check(job)
     LAUNCHERS[launcher](jobs, at_once, out, of_slurm)
 
 
-def _executor(cluster: str, out: Path) -> Any:
-    """The library's executor. Raises ConfigError where it or its cluster is missing."""
+def _executor(out: Path) -> Any:
+    """The library's executor. Raises ConfigError where it or SLURM is missing."""
     try:
         import submitit
     except ImportError as error:
         raise ConfigError(
-            f"launcher={cluster} needs the extra sweep, pip install 'pegasus-jax[sweep]'; launcher=print needs nothing"
+            "launcher=slurm needs the extra sweep, pip install 'pegasus-jax[sweep]'; launcher=print needs nothing"
         ) from error
     try:
-        return submitit.AutoExecutor(folder=out / "jobs", cluster=cluster)
+        return submitit.AutoExecutor(folder=out / "jobs", cluster="slurm")
     except RuntimeError as error:
-        raise ConfigError(f"launcher={cluster}: {' '.join(str(error).split())}; launcher=local is here") from error
+        raise ConfigError(f"launcher=slurm: {' '.join(str(error).split())}; launcher=local is here") from error
 
 
-def _command(job: Job, environment: dict[str, str] | None = None) -> Any:
-    """What a launcher calls: a fresh interpreter, so that no two runs share anything."""
+def _command(job: Job) -> Any:
+    """What a cluster calls: a fresh interpreter, so that no two runs share anything."""
     from submitit.helpers import CommandFunction
 
-    return CommandFunction([*PROGRAM, *job.words], verbose=False, env=environment)
+    return CommandFunction([*PROGRAM, *job.words], verbose=False)
