@@ -16,7 +16,7 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.train import check as check_command
 from pegasus_jax.cli.train import understood
 from pegasus_jax.config import Config, Explore
-from pegasus_jax.runs import check
+from pegasus_jax.runs import check, config_io
 from pegasus_jax.tasks.cost_check import Facts
 from probes import TINY_WORDS, cart
 
@@ -268,9 +268,17 @@ def test_a_run_that_ends_before_its_first_search_is_noted(trials: int, random: i
         ("final=maybe", "final=maybe is"),
         ("mesh=4", "mesh=4 is not of the form SEEDSxPARTICLES"),
         ("mesh=2x1", "mesh=2x1 cannot share 1 seeds evenly; mesh=1x1"),
+        ("processes=2", "coordinator=HOST:PORT, processes=N and process=I"),
     ],
 )
 def test_what_a_run_would_refuse_the_check_refuses_too(word: str, told: str) -> None:
     for command in (check_command, understood):
         with pytest.raises(ConfigError, match=told):
             command(["task=cartpole", word])
+
+
+def test_what_is_of_no_use_is_not_recommended() -> None:
+    """The horizon of a task of ours is its own."""
+    found = "\n".join(check.report(config_io.parse({"task": "cartpole"})))
+    assert "25 periods of 0.1 s an episode" in found
+    assert "horizon=" not in found

@@ -253,9 +253,12 @@ def test_the_command_says_what_it_wrote(runs: dict[str, Path], capsys: pytest.Ca
         (["trial=x"], "trial=x is not a trial"),
         (["overwrite=yes"], "overwrite=yes is neither"),
         (["fomat=c"], "did you mean 'format'"),
+        ([f"out={run}/kept.py", "overwrite=true"], "kept.py.json is a folder; another out= is free"),
     ):
+        (run / "kept.py.json").mkdir(exist_ok=True)
         with pytest.raises(ConfigError, match=complaint):
             cli.handle([str(run), *words])
+    assert not (run / "kept.py").exists()
 
 
 def test_the_command_ends_in_one_line(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from folders import a_run
-from pegasus_jax import tasks
+from pegasus_jax import start, tasks
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli import runs as commands
@@ -21,7 +21,7 @@ from pegasus_jax.cli.words import OF_RUN
 from pegasus_jax.exports.drive import drives
 from pegasus_jax.exports.write import export
 from pegasus_jax.learn.data import grow
-from pegasus_jax.runs import checkpoint, config_io, evaluation, restore, store
+from pegasus_jax.runs import checkpoint, config_io, evaluation, groups, restore, store
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.viz.video import film
 from probes import same
@@ -267,3 +267,55 @@ def test_a_run_of_an_older_version_has_no_policy_to_go_back_to(tmp_path: Path, m
     state = restore.restored(older_run)[2]
     assert (int(state.working_trial), bool(state.succeeded)) == (0, False)
     assert same(state.working, state.policy.params)
+
+
+def test_the_newest_policy_is_said_to_be_older_where_its_checkpoint_is_damaged(
+    run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    damaged = next(path for path in sorted((run / "checkpoints" / "0003" / "d").iterdir()) if path.is_file())
+    damaged.write_bytes(b"")
+    assert int(restore.ready(run, "last")[2].trial) == 2
+    assert "note: checkpoint 3 is not usable" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("task", ["3", '"cartpole"', "[1]"])
+def test_a_task_that_is_none_is_said_to_be_damaged(run: Path, task: str) -> None:
+    (run / "run.json").write_text(f'{{"task": {task}}}')
+    with pytest.raises(RunError, match=r"run.json is damaged; without it, resume=.* writes a new one"):
+        restore.same(run, tasks.make("cartpole"), config_io.load(run / "config.yaml"))
+
+
+def test_runs_that_go_on_together_differ_in_their_seeds_alone(tmp_path: Path) -> None:
+    """Else the settings of the first would take the place of the others'."""
+    a_run(tmp_path / "seed0", trials=1)
+    a_run(tmp_path / "seed1", trials=1, seed="1", model__kl_weight="0.5")
+    with pytest.raises(ConfigError, match=r"seed1 has model.kl_weight=0.5, and .*seed0 0.1; go on with each by its"):
+        start.going_on(tmp_path, {"trials": "3"})
+    change(tmp_path / "seed1", model__kl_weight=0.1, trials=7)
+    assert [*start.going_on(tmp_path, {"trials": "9"}).runs] == [0, 1]
+    with pytest.raises(ConfigError, match="seed1 has trials=7, and"):
+        start.going_on(tmp_path, {})
+
+
+def test_a_misspelt_word_of_a_run_that_goes_on_is_answered_with_the_nearest(run: Path) -> None:
+    for word, said in (
+        ("serch.steps", "serch.steps is not a setting; did you mean 'search.steps'"),
+        ("model.hidden", "model.hidden cannot be changed by resume="),
+        ("seeds", "seeds cannot be changed by resume="),
+        ("env_args.port", "env_args.port cannot be changed by resume="),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            start.going_on(run, {word: "3"})
+
+
+def test_a_run_is_found_whatever_of_its_files_is_missing(run: Path) -> None:
+    (run / "run.json").unlink()
+    assert groups.found([run.parent]) == [run]
+    assert "run.json cannot be read" in groups.readable([a_run(run.parent / "other", trials=1), run])[1][0]
+
+
+def test_a_run_with_runs_inside_is_that_run(run: Path) -> None:
+    a_run(run / "seed1", trials=1)
+    assert store.seeds_of(run) == {}
+    with pytest.raises(RunError, match=rf"is not a run \(it has no config.yaml\); there are {run}$"):
+        store.existing(run.parent)

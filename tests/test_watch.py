@@ -81,6 +81,7 @@ def test_a_page_is_sent_again_only_where_it_changed(run: Path) -> None:
             urlopen(again)
         store.write_trials(run, [row(trial) for trial in (1, 2, 3)])
         assert urlopen(again).status == 200
+        assert urlopen(Request(address, headers={"Host": "localhost"})).status == 200  # of port 80 a browser names none
         for wrong, headers in (("etc/passwd", {}), ("", {"Host": "example.com"})):
             with pytest.raises(HTTPError, match=r"40[34]"):
                 urlopen(Request(address + wrong, headers=headers))

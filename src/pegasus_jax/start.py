@@ -10,9 +10,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax.checks import SIZES, ConfigError, brief, check_range
+from pegasus_jax.checks import SIZES, ConfigError, brief, check_range, shown
 from pegasus_jax.config import Config, label
-from pegasus_jax.config_used import check_config, check_used
+from pegasus_jax.config_used import check_config, check_used, leaves
 from pegasus_jax.runs import trackers
 
 Mesh = Any  # a jax.sharding.Mesh; None: one device
@@ -132,19 +132,38 @@ def going_on(home: Path, changes: dict[str, Any]) -> Asked:
     A function, which from Python takes the place of one that nobody else can import, is the caller's word.
     """
     from pegasus_jax.runs import config_io, store
+    from pegasus_jax.runs.removed import refuse
 
     if wrong := sorted(key for key, value in changes.items() if not (_changeable(key) or callable(value))):
-        raise ConfigError(
+        refuse(wrong[0])
+        raise config_io.misspelt(wrong[0], ("out", "seeds")) or ConfigError(
             f"{wrong[0]} cannot be changed by resume=; only trials=, eval_episodes=, fit.*, search.* can, and mjcf= if"
             " the file was moved"
         )
     runs = store.seeds_of(home)
     first = store.existing(next(iter(runs.values()), home))
     mjcf = changes.pop("mjcf", None)
-    config = config_io.override(config_io.load(first / "config.yaml"), config_io.values(changes))
+    configs = {
+        run: config_io.override(config_io.load(run / "config.yaml"), config_io.values(changes))
+        for run in runs.values() or [first]
+    }
+    config = configs[first]
+    _alike(configs)
     check_used(config.task, changes)
     _one_environment(config, len(runs))
     return Asked(config, home, runs or {config.seed: home}, first, mjcf)
+
+
+def _alike(configs: dict[Path, Config]) -> None:
+    """Raises ConfigError where runs that are to go on together differ in more than their seeds."""
+    (first, one), *others = configs.items()
+    for run, other in others:
+        same = leaves(replace(one, seed=other.seed))
+        if differs := [key for key, value in leaves(other).items() if same.get(key) != value]:
+            raise ConfigError(
+                f"{run} has {differs[0]}={shown(leaves(other)[differs[0]])}, and {first} {shown(same.get(differs[0]))};"
+                f" go on with each by itself, for example resume={run}"
+            )
 
 
 def _changeable(key: str) -> bool:

@@ -15,6 +15,7 @@ from pegasus_jax.runs import trackers
 from pegasus_jax.start import Asked
 
 OPTIONS = tuple(WORDS)  # words that are no settings
+TOGETHER = {"coordinator", "processes", "process"}  # options, all or none
 
 begun: list[Path] = []  # the folder of what this process learns, for whoever stops it
 
@@ -56,6 +57,8 @@ def _settled(asked: Asked, options: Mapping[str, str]) -> Asked:
     final = true("final", options.get("final", "false"))
     if "mesh" in options:
         _shape(options["mesh"], len(asked.runs))
+    if (given := TOGETHER & {*options}) and given != TOGETHER:
+        raise ConfigError("coordinator=HOST:PORT, processes=N and process=I (from 0) go together")
     return asked._replace(final=final, track=trackers.asked(options.get("track")))
 
 
@@ -87,11 +90,9 @@ def _join(options: dict[str, str]) -> None:
     """Join the other processes of a study, if there are any, through jax.distributed."""
     import jax
 
-    given = {name for name in ("coordinator", "processes", "process") if name in options}
+    given = TOGETHER & {*options}
     if not (true("distributed", options.get("distributed", "false")) or given):
         return
-    if given and len(given) < 3:
-        raise ConfigError("coordinator=HOST:PORT, processes=N and process=I (from 0) go together")
     try:
         if given:
             count, index = (whole(name, options[name]) for name in ("processes", "process"))

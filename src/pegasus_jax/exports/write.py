@@ -87,6 +87,8 @@ def destination(run: Path, format: str, out: str | Path | None, overwrite: bool)
     if file.name != right.name:
         raise ConfigError(f"out={out} is no name for format={format}; the nearest is out={file.with_name(right.name)}")
     for path in (file, contract_of(file)):
+        if path.is_dir():
+            raise ConfigError(f"{path} is a folder; another out= is free")
         if path.exists() and not overwrite:
             raise ConfigError(f"{path} is there already; overwrite=true replaces it, another out= keeps it")
     return file

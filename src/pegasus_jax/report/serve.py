@@ -137,4 +137,4 @@ def server(paths: Sequence[Path], port: int) -> ThreadingHTTPServer:
 
 def _from_here(host: str) -> bool:
     """Whether a browser asked for this machine by name: a foreign page's name for 127.0.0.1 is not answered."""
-    return host.rpartition(":")[0] in (HOST, "localhost")
+    return host.partition(":")[0] in (HOST, "localhost")

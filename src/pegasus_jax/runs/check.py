@@ -11,7 +11,7 @@ from pegasus_jax import tasks
 from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.assembly.schedules import at_starts, width_of
 from pegasus_jax.checks import ConfigError, shown, some
-from pegasus_jax.config import Config, Search, first_search
+from pegasus_jax.config import Config, Search, first_search, uses
 from pegasus_jax.imagine import costs
 from pegasus_jax.logs.read import Logged
 from pegasus_jax.math.circles import entries
@@ -238,7 +238,7 @@ def report(config: Config) -> list[str]:
             )
         ),
         "time": f"{task.horizon} periods of {task.dt:g} s an episode, {task.horizon * task.dt:g} s"
-        + ("" if asked.horizon else "; horizon= changes that"),
+        + ("; horizon= changes that" if asked.horizon is None and uses(asked.task, "horizon") else ""),
         "start": f"{_numbers(task.start_mean)}, give or take {_numbers(task.start_std)}",
         "cost there": f"{np.mean(begun):.4g} on average; below {task.success:g} is success"
         + (f"; searches begin with a cost {wide:.2g} times as wide" if wide > 1.05 else ""),

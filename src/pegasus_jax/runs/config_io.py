@@ -65,7 +65,7 @@ def parse(words: Mapping[str, Any], options: Sequence[str] = ()) -> Config:
     for key in words:
         refuse(key)
         if key not in known:
-            raise ConfigError(f"{key} is not a setting{_of_others(key)}; {_hint(key, [*known, *NAMED, *options])}")
+            raise unknown(key, [*known, *NAMED, *options])
         check_used(config.task, {key: words[key]})
     changed = override(config, values(words))
     check_needed(changed, words)
@@ -132,7 +132,7 @@ def override(config: Config, changes: dict[str, Any]) -> Config:
     for key in changes:
         refuse(key)
         if key not in known:
-            raise ConfigError(f"{key} is not a setting{_of_others(key)}; {_hint(key, [*known])}")
+            raise unknown(key, [*known])
     return _changed(config, changes, "")
 
 
@@ -197,6 +197,17 @@ def stored_config(stored: dict[str, Any]) -> Config:
     if wrong := sorted(set(stored) - set(leaves(config))):
         raise ConfigError(f"not the config of a run of this version: see {', '.join(wrong[:5])}")
     return override(config, stored)
+
+
+def misspelt(key: str, options: Sequence[str]) -> ConfigError | None:
+    """What to say of a word's key that is no setting of any kind, none of the options and no preset's; else None."""
+    every = [*leaves(Config()), *NAMED, *options]
+    return None if key in every or _argument(key) or _of_others(key) else unknown(key, every)
+
+
+def unknown(key: str, choices: Sequence[str]) -> ConfigError:
+    """What to say of a key that is none of the choices."""
+    return ConfigError(f"{key} is not a setting{_of_others(key)}; {_hint(key, choices)}")
 
 
 def _of_others(key: str) -> str:

@@ -77,9 +77,10 @@ def _below(path: Path) -> list[Path]:
     runs = []
     for folder, inner, names in os.walk(path):
         here = Path(folder)
-        if {"config.yaml", "run.json"} <= {*names}:
+        is_run = "config.yaml" in names and not {"run.json", "trials.jsonl", "episodes"}.isdisjoint([*names, *inner])
+        if is_run:
             runs.append(here)
-        if {"config.yaml", "run.json"} <= {*names} or len(here.relative_to(path).parts) >= DEPTH:
+        if is_run or len(here.relative_to(path).parts) >= DEPTH:
             inner.clear()
         inner[:] = [name for name in inner if not name.startswith(".")]
     return sorted(runs, key=lambda run: [_natural(part) for part in run.parts])

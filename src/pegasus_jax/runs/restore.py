@@ -73,6 +73,8 @@ def _state(run: Path, trial: Trial, like: RunState) -> RunState:
         if state is None:
             why = f": {problems[0]}" if problems else f"; resume={run} makes one"
             raise RunError(f"{run / 'checkpoints'} holds no checkpoint that this version can use{why}")
+        for problem in problems:
+            print(f"note: {problem}", file=sys.stderr)
         return jax.tree.map(lambda leaf: leaf[0], state)
     number = best(run) if trial == BEST else trial
     there = checkpoint.available(run)
@@ -226,6 +228,7 @@ def same(run: Path, task: Task, config: Config) -> None:
     """Raises RunError unless this is the task that a run of this config began with, as far as its folder tells."""
     if not (run / "run.json").exists():
         return
+    store.task_of(run)  # facts that are none are said before they are compared
     if what := facts.difference(store.stored(run)["task"], facts.of_task(task), isinstance(config.model, Lagrangian)):
         raise RunError(f"the task of {run / 'config.yaml'} is not that of run.json, with which it began: {what}")
 

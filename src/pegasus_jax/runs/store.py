@@ -88,7 +88,9 @@ def enough(trials: int, done: int) -> None:
 def existing(path: Path) -> Path:
     """The folder of a run. Raises RunError when there is none, or something in it is no file or no folder."""
     if not (path / "config.yaml").exists():
-        there = [str(p.parent) for p in sorted(path.parent.glob("*/config.yaml"))] if path.parent.is_dir() else []
+        inside = path.glob("*/config.yaml") if path.is_dir() else ()
+        beside = path.parent.glob("*/config.yaml") if path.parent.is_dir() else ()
+        there = [name for p in sorted(inside) or sorted(beside) if (name := str(p.parent)).isprintable()]
         near = difflib.get_close_matches(str(path), there, 5, cutoff=0.0)
         hint = f"; there are {', '.join(near)}" if near else ""
         raise RunError(f"{path} is not a run (it has no config.yaml){hint}")
@@ -101,6 +103,8 @@ def existing(path: Path) -> Path:
 
 def seeds_of(path: Path) -> dict[int, Path]:
     """Seed -> folder of the runs that one study left in `path`; none where it is a run itself, or nothing."""
+    if (path / "config.yaml").exists():
+        return {}
     found = sorted(path.glob("seed*/config.yaml"), key=lambda p: (len(p.parent.name), p.parent.name))
     return {int(p.parent.name.removeprefix("seed")): p.parent for p in found if p.parent.name[4:].isdecimal()}
 
@@ -345,6 +349,8 @@ def stored(run: Path) -> dict[str, Any]:
     except ValueError as error:
         raise RunError(f"{path} is damaged; without it, resume={run} writes a new one") from error
     if not isinstance(found, dict) or not isinstance(found.get("commands", []), list):
+        raise RunError(f"{path} is damaged; without it, resume={run} writes a new one")
+    if not isinstance(found.get("task", {}), dict):
         raise RunError(f"{path} is damaged; without it, resume={run} writes a new one")
     if "task" not in found:
         versions = found.get("versions")
