@@ -200,3 +200,10 @@ def test_nothing_of_the_user_s_reads_beyond_the_observation(name):
 def test_a_simulator_and_a_first_controller_read_what_there_is(name, reads):
     with pytest.raises(ConfigError, match=rf"{name}=.* reads entry \d of an array of \d at test_cost_check.py"):
         check.report(start.preset("cartpole", model="log_normal", settings={name: reads}))
+
+
+def test_what_x_has_is_said_where_it_is_x_that_is_read() -> None:
+    for cost, of_x in ((lambda x, u: x[4] + u[0], True), (lambda x, u: x[0] + u[1], False)):
+        with pytest.raises(ConfigError, match=r"reads entry [14] of an array of") as error:
+            cost_check.within(cost, (2, 1), 2, "cost=it")
+        assert ("x has 2, 0 to 1" in str(error.value)) == of_x

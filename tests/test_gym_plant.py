@@ -25,7 +25,7 @@ from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.config import Config
 from pegasus_jax.memory import past_controls
 from pegasus_jax.policies.driver import driver
-from pegasus_jax.runs import config_io, store
+from pegasus_jax.runs import check, config_io, store
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.start import preset
 from pegasus_jax.task import Task
@@ -388,8 +388,31 @@ def test_a_control_period_that_nobody_said_or_two_did_is_noted(about: dict, dt: 
     [("gym", None, 1000, True), ("gym", None, 100, False), ("gym", 1000, 1000, False), ("cartpole", None, 1000, False)],
 )
 def test_a_horizon_that_nobody_said_and_is_long_is_noted(task: str, said: int | None, own: int, told: bool) -> None:
+    gymnasium.register("Long-v0", Base, max_episode_steps=1000)
     notes = assumed.length(Config(task=task, env="Long-v0", horizon=said), cart()._replace(horizon=own))
     assert [note.startswith("an episode has the environment's own 1000 periods") for note in notes] == [True] * told
+
+
+@pytest.mark.parametrize(("horizon", "told"), [(5, False), (9, True)])
+def test_a_limit_that_ends_every_episode_early_is_noted(horizon: int, told: bool) -> None:
+    gymnasium.register("Brief-v0", Base, max_episode_steps=5)
+    config = Config(task="gym", env="Brief-v0", dt=0.1, horizon=horizon)
+    found = assumed.length(config, task_of("Brief-v0", 1, horizon))
+    assert [note.partition(":")[0] for note in found] == [
+        "horizon=9, and the environment's own limit ends each episode after 5 periods"
+    ] * told
+
+
+def test_a_rate_that_is_computed_is_no_dead_sensor() -> None:
+    draw = np.random.default_rng(0)
+    made = type("Encoder", (Base,), {"reset": lambda self, **_: (draw.normal(size=1), {})})
+    gymnasium.register("Encoder-v0", made)
+    words = {"task": "gym", "env": "Encoder-v0", "dt": "0.1", "horizon": "5", "eval_episodes": "0"}
+    words |= {"cost": lambda x: 1 - jnp.exp(-(x[0] ** 2)), "sensors.velocity": "difference"}
+    found = "\n".join(check.report(config_io.parse(words)))
+    assert "rate of x0" in found
+    assert "may be dead" not in found
+    close_environments()
 
 
 @pytest.mark.parametrize(("task", "episodes", "count"), [("gym", 20, 1), ("gym", 0, 0), ("cartpole", 20, 0)])
@@ -406,6 +429,7 @@ def test_episodes_that_only_measure_are_noted_where_a_robot_may_run_them(task: s
         (gymnasium.spaces.Dict({"a": gymnasium.spaces.Box(-1, 1, (2,)), "b": gymnasium.spaces.Box(-1, 1)}), 3),
         (gymnasium.spaces.Box(-1, 1, (2, 3)), 6),
         (gymnasium.spaces.Sequence(gymnasium.spaces.Discrete(2)), None),
+        (gymnasium.spaces.Box(0, 255, (32, 32, 3), np.uint8), None),
     ],
 )
 def test_an_observation_that_is_no_vector_is_refused_with_a_way_out(observed: Any, says: int | None) -> None:
@@ -415,6 +439,9 @@ def test_an_observation_that_is_no_vector_is_refused_with_a_way_out(observed: An
     with pytest.raises(ValueError, match="not a Box of one dimension; ") as error:
         env_spec("Shaped-v0")
     assert ("FlattenObservation(env)" in str(error.value)) == (says is not None)
+    assert ("3,072 numbers are too many for this program, as an image's are" in str(error.value)) == (
+        observed.shape == (32, 32, 3)
+    )
     if says:
         gymnasium.register("Flat-v0", lambda: gymnasium.wrappers.FlattenObservation(made()))
         assert env_spec("Flat-v0").start_mean.shape == (says,)

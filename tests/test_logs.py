@@ -184,6 +184,23 @@ def test_a_number_that_is_missing_in_an_angle_is_the_only_one():
     np.testing.assert_array_equal(np.isnan(between), [False, False, True, True, False, True])  # the last is outside
 
 
+def test_rows_out_of_order_are_said(tmp_path):
+    """A time that goes back begins an episode; where it does not go back to a beginning, rows may be swapped."""
+    swapped = TIMED[[0, 1, 3, 2, 4]]
+    notes = transitions(CART, written(tmp_path / "a.csv", "t,x,v,u", swapped))[1]
+    assert any("line 5: time goes back from 0.9 to 0.6 s, and another episode begins; sort" in note for note in notes)
+    notes = transitions(CART, written(tmp_path / "b.csv", "t,x,v,u", np.concatenate([TIMED, TIMED])))[1]
+    assert not notes
+
+
+def test_a_folder_of_logs_and_another_unit_of_time_get_a_way_out(tmp_path):
+    slow = written(tmp_path / "a.csv", "t,x,v,u", TIMED * [1e9, 1, 1, 1])
+    with pytest.raises(ConfigError, match=r"a row every 3e\+08 s is too rare.*t=COLUMN\*1e-09,"):
+        read([slow], CART)
+    with pytest.raises(ConfigError, match=rf"data={tmp_path} is a folder; data='{tmp_path}/\*.csv' names its files"):
+        read([str(tmp_path)], CART)
+
+
 def test_an_episode_of_one_control_is_one(tmp_path):
     """As a robot's log that ends in its first period, whose time of the last observation nobody wrote."""
     rows = dict(x=ROWS[:2, :2], u=ROWS[:1, 2:], time=np.zeros(1), dt=0.3, state_names=("x", "v"), control_names=("u",))

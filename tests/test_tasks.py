@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -17,6 +19,8 @@ from pegasus_jax.assembly.pieces import dynamics_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Config, Lagrangian
 from pegasus_jax.runs import config_io, store
+from pegasus_jax.task import Signal
+from pegasus_jax.tasks import assumed
 from pegasus_jax.types import Dataset
 
 # (task, legs, states, controls, horizon, control period [s])
@@ -128,3 +132,19 @@ def test_a_mechanism_of_ones_own_is_five_and_takes_the_steps_that_its_coordinate
         changes[substeps] = change()
     assert (changes[None] == changes[4]).all()
     assert not jnp.allclose(changes[None], changes[1])
+
+
+def test_what_is_not_drawn_or_not_observed_is_noted() -> None:
+    fixed, drawn = lambda key: jnp.ones(2), lambda key: jax.random.uniform(key, (2,))
+    for value, count in ((fixed, 1), (drawn, 0)):
+        task = tasks.make("cartpole")._replace(goal=Signal(value, (1.0, 1.0)))
+        found = assumed.goals(Config(goals=value), task)
+        assert [note.partition(" for each")[2][:12] for note in found] == [" of 100 keys"] * count
+    file = (
+        "<mujoco><worldbody><body><joint name='j'/><geom size='.1'/></body></worldbody>"
+        "<actuator><general joint='j' dyntype='filter' dynprm='.1'/></actuator></mujoco>"
+    )
+    plant = SimpleNamespace(model=mujoco.MjModel.from_xml_string(file))
+    for history, count in ((1, 1), (2, 0)):
+        found = assumed.actuators(Config(task="mjcf", history=history), tasks.make("cartpole")._replace(plant=plant))
+        assert len(found) == count

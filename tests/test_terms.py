@@ -85,7 +85,7 @@ def test_a_cost_that_nobody_can_serve_is_one_line(cost, said):
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ({"goal_low": "[0]", "goal_high": "[1]"}, "goal_low= and goal_high= is of no use: cost=.* no parameter goal"),
+        ({"goal_low": "[0]", "goal_high": "[1]"}, "the goal is of no use: cost=.* no parameter goal"),
         ({"goal_low": "[0,0]", "goal_high": "[1]"}, "goal_low has 2 entries and goal_high 1"),
         ({"goal_low": "[0]", "goal_high": "[0]"}, "goal_low=0 must be less than goal_high=0"),
         ({"goal_low": "[0]", "goal_high": "[1]", "goals": goals}, "leave out goal_low= and goal_high="),

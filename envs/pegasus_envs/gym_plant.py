@@ -12,11 +12,13 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 from gymnasium.envs.registration import load_env_creator
+from gymnasium.spaces.utils import flatdim
 
 from pegasus_envs.plant import filled
 
 LARGEST = 1e15  # of a reading: squares of larger ones overflow single precision in a fit
 PYTHONS = {"True": "true", "False": "false", "None": "null"}  # for JSON: an environment is written in Python
+MOST = 1000  # numbers of an observation that may be flattened: an image has more, and nothing here is for those
 RESETS = 100  # from which the distribution of starts is estimated where it is not given
 
 
@@ -139,7 +141,9 @@ def env_spec(
     # A box may have limits in single precision, and a number that is typed has not.
     kind = controls.dtype.type if np.issubdtype(controls.dtype, np.floating) else float  # type: ignore[union-attr]
     for least, greatest, bottom, top in zip(low, high, controls.low, controls.high, strict=True):
-        if not (bottom <= kind(least) and least < greatest and kind(greatest) <= top):
+        if not least < greatest:
+            raise ValueError(f"controls from {least:g} to {greatest:g}: expected control_low below control_high")
+        if not (bottom <= kind(least) and kind(greatest) <= top):
             raise ValueError(
                 f"controls from {least:g} to {greatest:g} are not among its own, from {bottom:g} to {top:g}"
             )
@@ -162,6 +166,8 @@ def _way_out(what: str, space: Any) -> str:
     """The end of a line that refuses a space: what makes a vector of numbers of it."""
     if what == "action_space":
         return "; controls must be numbers in a range, as Box(-1, 1, (2,))"
+    if getattr(space, "is_np_flattenable", False) and (size := flatdim(space)) > MOST:
+        return f"; its {size:,} numbers are too many for this program, as an image's are"
     if getattr(space, "is_np_flattenable", False):
         return "; register an environment that returns gymnasium.wrappers.FlattenObservation(env), which makes one"
     return "; an observation must be numbers, as Box(-inf, inf, (4,))"

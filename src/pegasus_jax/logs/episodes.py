@@ -8,11 +8,13 @@ import numpy as np
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.logs.columns import SETTING, Column, Layout, numbers, untimed
 from pegasus_jax.logs.table import Table, names_of
+from pegasus_jax.logs.times import nearest
 from pegasus_jax.math.circles import to_state
 from pegasus_jax.memory import measured
 from pegasus_jax.task import Task
 
 JITTER = 0.05  # of a period, by which rows may come early or late without being interpolated
+BACK = 1.5  # periods from the first time of a log to that with which another episode of it begins, at most
 GAP = 3.0  # periods without a row that end an episode
 RARE = 5.0  # control periods from row to row that no interpolation fills
 ROUNDING = 1e-3  # of a control's range, by which a file's numbers may be beyond it
@@ -47,6 +49,11 @@ def segments(table: Table, where: Layout, task: Task, control: str, note: Note) 
         note(untimed(table, where, names_of(task), task.dt))
     _within_limits(table, sent, where, task)
     begins = np.diff(t) < 0
+    for row in np.flatnonzero(begins & (t[1:] > t[0] + BACK * task.dt)):  # not to a beginning
+        note(
+            f"{table.where(row + 1)}: time goes back from {t[row]:g} to {t[row + 1]:g} s, and another episode begins;"
+            " sort the rows where they are of one"
+        )
     if where.episode is not None:
         begins |= np.diff(numbers(table, Column(where.episode))) != 0
     episodes = np.split(np.arange(len(t)), np.flatnonzero(begins) + 1)
@@ -80,7 +87,7 @@ def _cuts(
     if usual > RARE * task.dt:
         raise ConfigError(
             f"{table.where(rows[0])}: a row every {usual:g} s is too rare for dt={task.dt:g}; in other units?"
-            f" {SETTING}=[t=COLUMN*0.001,...] makes seconds of milliseconds"
+            f" {SETTING}=[t=COLUMN*{nearest(usual, task.dt):g},...] makes seconds of them"
         )
     whole: np.ndarray = np.all(np.isfinite(seen[0]), axis=1)
     known: np.ndarray = np.all(np.isfinite(seen[1]), axis=1)

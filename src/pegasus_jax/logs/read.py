@@ -109,6 +109,8 @@ def tables(files: Sequence[str], names: Names, columns: Sequence[str], control: 
 
 def _table(path: Path, names: Names, columns: Sequence[str], control: str) -> Table:
     suffix = path.suffix.lower()
+    if path.is_dir() and (inside := sorted(one.suffix for one in path.iterdir() if one.suffix in (".csv", ".npz"))):
+        raise ConfigError(f"data={path} is a folder; data='{path}/*{inside[0]}' names its files")
     if suffix in bags.SUFFIXES or path.is_dir():
         return bags.of_bag(path, names, columns, control)
     if suffix == ".npz":

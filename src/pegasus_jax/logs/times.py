@@ -44,7 +44,7 @@ def alike(table: Table, unused: Sequence[str], dt: float) -> Named | None:
     even = [name for name in steps if _even(steps[name]) and not counts(table, name)]
     for name in [*named, *even][:1]:
         units = [scale for word in _words(name) if word != "t" and (scale := factor(word, "s"))]
-        return name, units[-1] if units else _nearest(float(np.nanmedian(steps[name])), dt)
+        return name, units[-1] if units else nearest(float(np.nanmedian(steps[name])), dt)
     return None
 
 
@@ -64,7 +64,8 @@ def _share(steps: np.ndarray, holds: Callable[[np.ndarray], np.ndarray]) -> floa
     return float(np.mean(holds(steps))) if len(steps) > 1 else 0.0
 
 
-def _nearest(step: float, dt: float) -> float:
+def nearest(step: float, dt: float) -> float:
+    """The unit of time [s] in which rows that are a `step` apart are nearest to dt [s] apart."""
     scales = [scale for unit in UNITS if (scale := factor(unit, "s"))]
     return min(scales, key=lambda scale: abs(math.log(step * scale / dt)))
 

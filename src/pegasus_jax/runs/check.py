@@ -70,12 +70,18 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     stopping(config, task)
     tasks.compared(config, task)
     readings = tasks.readings(config, task, resets)
+    # A rate that is computed is 0 after a reset, and no sensor's.
+    seen_at = [i for i in range(len(task.state_names)) if config.sensors.velocity == "none" or i not in task.rates]
     return [
         *rates,
         *notes,
         *turning(facts, task.state_names),
         *plausible(readings, facts, task.state_names),
-        *alike(readings, task.angles, task.state_names),
+        *alike(
+            readings[:, seen_at],
+            tuple(seen_at.index(i) for i in task.angles if i in seen_at),
+            tuple(task.state_names[i] for i in seen_at),
+        ),
     ]
 
 
@@ -117,6 +123,8 @@ def unsaid(given: Config, known: Config, task: Task) -> list[str]:
         assumed.notes(given)
         + assumed.length(given, task)
         + assumed.rotations(given, task)
+        + assumed.actuators(given, task)
+        + assumed.goals(given, task)
         + circles_found(given, known)
         + assumed.networks(given.model, len(task.state_names))
     )

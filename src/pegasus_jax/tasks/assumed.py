@@ -4,9 +4,11 @@ from contextlib import suppress
 
 import numpy as np
 
+from pegasus_jax.checks import shown
 from pegasus_jax.config import GYM, MJCF, Config
 from pegasus_jax.config_models import Model, several, sized
 from pegasus_jax.task import Task
+from pegasus_jax.tasks.signals import draws
 
 MANY = 100  # control periods of an episode
 
@@ -33,8 +35,22 @@ def notes(given: Config) -> list[str]:
 
 
 def length(given: Config, task: Task) -> list[str]:
-    """The note that an episode has as many control periods as the environment's own limit, where these are many."""
-    if given.task != GYM or given.horizon is not None or task.horizon <= MANY:
+    """The note that an episode has as many control periods as the environment's own limit, where these are many.
+
+    Or that this limit ends every episode before its horizon: what is left then costs, and none can succeed.
+    """
+    if given.task != GYM:
+        return []
+    from pegasus_envs.gym_plant import make_env
+
+    spec = make_env(given.env or "", given.env_args).spec
+    own = spec.max_episode_steps if spec else None
+    if own is not None and own < task.horizon:
+        return [
+            f"horizon={task.horizon}, and the environment's own limit ends each episode after {own} periods: each that"
+            f" is left costs stop_cost={given.stop_cost:g}, and none succeeds; horizon={own} is as long as its limit"
+        ]
+    if given.horizon is not None or task.horizon <= MANY:
         return []
     return [
         f"an episode has the environment's own {task.horizon} periods, and each iteration of a search goes through all"
@@ -54,6 +70,21 @@ def rotations(given: Config, task: Task) -> list[str]:
         " is not quite a rotation; hinges have angles, and observe= can leave it out"
         for joint, entries in found.items()
     ]
+
+
+def actuators(given: Config, task: Task) -> list[str]:
+    """The note that an MJCF file's actuators have a state of their own, which is not observed; or none."""
+    count = task.plant.model.na if given.task == MJCF else 0
+    what = f"{count} of the file's actuators have a state of their own (act), which is not observed"
+    return [f"{what}; history=2 tells some of it"] if count and given.history == 1 else []
+
+
+def goals(given: Config, task: Task) -> list[str]:
+    """The note that goals= does not draw: its goal is the same for every key; or none."""
+    if given.goals is None or task.goal is None or np.ptp(drawn := draws(task.goal.value), axis=0).any():
+        return []
+    same = f"goals={shown(given.goals)} gives {drawn[0].tolist()} for each of {len(drawn)} keys"
+    return [f"{same}; to draw, use jax.random with the key: NumPy draws once, while JAX traces"]
 
 
 def networks(model: Model, states: int) -> list[str]:

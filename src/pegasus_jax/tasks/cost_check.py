@@ -170,9 +170,9 @@ def within(
     with blamed(what, blame or function):
         program = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct((n,), jnp.zeros(()).dtype) for n in sizes))
     for index, length, line in beyond(program):
+        of_x = f"; x has {observed}, 0 to {observed - 1}, and rates behind them with sensors.velocity="
         raise ConfigError(
-            f"{what} reads entry {index} of an array of {length}{_in(line)}; x has {observed}, 0 to {observed - 1}, and"
-            " rates behind them with sensors.velocity="
+            f"{what} reads entry {index} of an array of {length}{_in(line)}{of_x if length >= observed else ''}"
         )
 
 

@@ -53,7 +53,7 @@ def agree(cost: Callable[..., Any], reference: Any, goal: Any) -> tuple[str, ...
         if term in terms and there is None:
             raise ConfigError(f"cost={name} takes a {term}, and there is none; give {SETTINGS[term]}")
         if there is not None and term not in terms:
-            raise ConfigError(f"{SETTINGS[term]} is of no use: cost={name} has no parameter {term}")
+            raise ConfigError(f"the {term} is of no use: cost={name} has no parameter {term}")
     return terms
 
 
