@@ -530,6 +530,8 @@ def test_limits_that_are_the_environments_own_are_typed_in_double_precision() ->
     np.testing.assert_allclose(spec.control_high, [0.7])
     with pytest.raises(ValueError, match=r"controls from -0\.7 to 0\.71 are not among its own"):
         env_spec("Narrow-v0", control_low=[-0.7], control_high=[0.71], dt=0.1)
+    with pytest.raises(ValueError, match=r"controls from 0\.5 to -0\.5: expected control_low below control_high"):
+        env_spec("Narrow-v0", control_low=[0.5], control_high=[-0.5], dt=0.1)
 
 
 @pytest.mark.parametrize("flags", [(np.array([False, False]), False), (False, np.zeros(2))])
