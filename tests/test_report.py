@@ -352,6 +352,7 @@ def test_nothing_of_a_user_is_replaced(run: Path, tmp_path: Path) -> None:
     [
         ([], "name one run, not 0"),
         (["nowhere"], "nowhere is not a run"),
+        (["RUN", "--film"], "'--film' is not an option here, key=value; did you mean 'film'"),
         (["RUN", "otu=a.html"], "otu is not an option here; did you mean 'out'"),
         (["RUN", "film=maybe"], "film=maybe is neither true nor false"),
         (["SWEEP", "film=true"], "film=true is for one run, not 6"),

@@ -72,6 +72,12 @@ def paths_and(words: Sequence[str], defaults: dict[str, str]) -> tuple[list[Path
     from pegasus_jax.checks import did_you_mean
     from pegasus_jax.runs import config_io
 
+    def nearest(word: str) -> str:
+        return did_you_mean(word, defaults) if defaults else "there are none"
+
+    for word in words:
+        if word.startswith("-") and not Path(word).exists():
+            raise ConfigError(f"'{word}' is not an option here, key=value; {nearest(word.lstrip('-'))}")
     named = [
         word for word in words if "=" not in word or (word.partition("=")[0] not in defaults and Path(word).exists())
     ]
@@ -80,9 +86,7 @@ def paths_and(words: Sequence[str], defaults: dict[str, str]) -> tuple[list[Path
     _, rest = config_io.split([word for word in words if word not in named])
     for key in rest:
         if key not in defaults:
-            raise ConfigError(
-                f"{key} is not an option here; {did_you_mean(key, defaults) if defaults else 'there are none'}"
-            )
+            raise ConfigError(f"{key} is not an option here; {nearest(key)}")
     return [Path(word) for word in named], defaults | rest
 
 
