@@ -15,7 +15,7 @@ from benchmarks import once
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.train import check as check_command
 from pegasus_jax.cli.train import understood
-from pegasus_jax.config import Config, Explore
+from pegasus_jax.config import Config, Explore, Sensors
 from pegasus_jax.runs import check, config_io
 from pegasus_jax.tasks.cost_check import Facts
 from probes import TINY_WORDS, cart
@@ -282,3 +282,11 @@ def test_what_is_of_no_use_is_not_recommended() -> None:
     found = "\n".join(check.report(config_io.parse({"task": "cartpole"})))
     assert "25 periods of 0.1 s an episode" in found
     assert "horizon=" not in found
+
+
+@pytest.mark.parametrize(("cutoff", "told"), [(1.0, False), (5.0, False), (100.0, True), (None, False)])
+def test_a_filter_that_hardly_filters_is_noted(cutoff: float | None, told: bool) -> None:
+    config = Config(sensors=Sensors(velocity="filter", cutoff=cutoff))
+    assert [note.partition(":")[0] for note in check.filtering(config, cart()._replace(dt=0.1))] == [
+        "sensors.cutoff=100 is above half of the control rate, 5 Hz"
+    ] * told

@@ -201,6 +201,12 @@ def test_a_folder_of_logs_and_another_unit_of_time_get_a_way_out(tmp_path):
         read([str(tmp_path)], CART)
 
 
+def test_a_file_in_another_code_is_said_to_be_that(tmp_path):
+    (tmp_path / "a.csv").write_bytes("x,größe,u\n0,0,0\n".encode("latin-1"))
+    with pytest.raises(ConfigError, match=r"a.csv is not in UTF-8, and has bytes at 4 that are not; save it so"):
+        read([str(tmp_path / "a.csv")], CART)
+
+
 def test_an_episode_of_one_control_is_one(tmp_path):
     """As a robot's log that ends in its first period, whose time of the last observation nobody wrote."""
     rows = dict(x=ROWS[:2, :2], u=ROWS[:1, 2:], time=np.zeros(1), dt=0.3, state_names=("x", "v"), control_names=("u",))

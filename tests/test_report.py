@@ -210,6 +210,8 @@ def warned(run: Look, **last: Any) -> str:
         ({"constraint_broken": True}, "warning: constraint broken in the episodes of trial 3"),
         ({"ended": "error"}, "warning: episodes ended early (error): trial 3"),
         ({"ended": "terminated"}, "note: episodes ended early (terminated): trial 3"),
+        # Not that the model is wrong: the periods behind the end cost, and no policy changes that.
+        ({"ended": "truncated", "mean_cost": 0.9}, "note: episodes ended early (truncated): trial 3"),
     ],
 )
 def test_a_warning_says_what_is_unusual_and_nothing_else(run: Path, last: dict[str, Any], says: str) -> None:

@@ -19,6 +19,8 @@ def of_csv(path: Path) -> Table:
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not in UTF-8, and has bytes at {error.start} that are not; save it so") from error
     except (OSError, ValueError) as error:
         raise ConfigError(f"{path} cannot be read: {reason(error)}") from error
     kept = [(number, line) for number, line in enumerate(lines, 1) if line.strip() and line[0] != "#"]

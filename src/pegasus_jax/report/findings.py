@@ -83,7 +83,8 @@ def _model(found: Look) -> Iterator[Finding]:
 def _costs(found: Look) -> Iterator[Finding]:
     last = found.rows[-1] if found.rows else {}
     real, fresh, held = (last.get(name) for name in ("mean_cost", "objective_fresh", "objective_last"))
-    if real is not None and fresh is not None and abs(real - fresh) > GAP:
+    whole = last.get("ended") != "truncated"  # what a time limit cuts off costs, and is not imagined
+    if whole and real is not None and fresh is not None and abs(real - fresh) > GAP:
         means = (
             "The plant costs more than was imagined: the model is wrong where this policy goes. More episodes teach it."
             if real > fresh

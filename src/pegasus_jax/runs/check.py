@@ -47,7 +47,7 @@ def before_training(config: Config, task: Task, resets: int = 1) -> list[str]:
     is looked at first: a mistake in it moves no robot.
     """
     guide.check(config, task)
-    rates = [*unlearned(config), *slow(task), *lasting(task)]
+    rates = [*unlearned(config), *slow(task), *filtering(config, task), *lasting(task)]
     if config.cost is None and task.constraint is None:
         return rates
     low, high = tasks.observation_limits(config, task)
@@ -108,6 +108,14 @@ def slow(task: Task) -> list[str]:
         elif (periods := (high - low) / change) > task.horizon:
             notes.append(f"control_rate={rate:g} lets {way} in {periods:.0f} periods; an episode has {task.horizon}")
     return notes
+
+
+def filtering(config: Config, task: Task) -> list[str]:
+    """The note on a filter of computed rates whose cutoff is above half of the control rate: one line, or none."""
+    cutoff, most = config.sensors.cutoff, 0.5 / task.dt
+    if cutoff is None or cutoff <= most:
+        return []
+    return [f"sensors.cutoff={cutoff:g} is above half of the control rate, {most:g} Hz: it hardly filters"]
 
 
 def lasting(task: Task) -> list[str]:
