@@ -158,19 +158,18 @@ def env_spec(
     places = np.reshape(np.array(starts, float), (-1, size))
     if len(places):
         mean, std = places.mean(0), places.std(0)
-    limit = env.spec.max_episode_steps if env.spec else None
-    return EnvSpec(low, high, dt or period(env), horizon or limit or 100, mean, std, places, states, actions)
+    return EnvSpec(low, high, dt or period(env), horizon or own_limit(env) or 100, mean, std, places, states, actions)
 
 
 def _way_out(what: str, space: Any) -> str:
     """The end of a line that refuses a space: what makes a vector of numbers of it."""
     if what == "action_space":
         return "; controls must be numbers in a range, as Box(-1, 1, (2,))"
-    if getattr(space, "is_np_flattenable", False) and (size := flatdim(space)) > MOST:
+    if not getattr(space, "is_np_flattenable", False):
+        return "; an observation must be numbers, as Box(-inf, inf, (4,))"
+    if (size := flatdim(space)) > MOST:
         return f"; its {size:,} numbers are too many for this program, as an image's are"
-    if getattr(space, "is_np_flattenable", False):
-        return "; register an environment that returns gymnasium.wrappers.FlattenObservation(env), which makes one"
-    return "; an observation must be numbers, as Box(-inf, inf, (4,))"
+    return "; register an environment that returns gymnasium.wrappers.FlattenObservation(env), which makes one"
 
 
 def named(env: Any, what: str, given: Sequence[str], size: int) -> tuple[str, ...]:
@@ -210,6 +209,11 @@ def own_period(env: Any) -> float | None:
     if isinstance(dt, bool) or not isinstance(dt, int | float | np.number) or not 0 < dt < np.inf:
         raise ValueError(f"its dt is {dt!r}, not a number of seconds; give dt=")
     return float(dt)
+
+
+def own_limit(env: Any) -> int | None:
+    """The control periods after which the environment ends each episode, or None."""
+    return env.spec.max_episode_steps if env.spec else None
 
 
 def env_plant(

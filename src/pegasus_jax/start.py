@@ -158,11 +158,11 @@ def _alike(configs: dict[Path, Config]) -> None:
     """Raises ConfigError where runs that are to go on together differ in more than their seeds."""
     (first, one), *others = configs.items()
     for run, other in others:
-        same = leaves(replace(one, seed=other.seed))
-        if differs := [key for key, value in leaves(other).items() if same.get(key) != value]:
+        wanted, found = leaves(replace(one, seed=other.seed)), leaves(other)
+        for key in (key for key in found if found[key] != wanted.get(key)):
             raise ConfigError(
-                f"{run} has {differs[0]}={shown(leaves(other)[differs[0]])}, and {first} {shown(same.get(differs[0]))};"
-                f" go on with each by itself, for example resume={run}"
+                f"{run} has {key}={shown(found[key])}, and {first} {shown(wanted.get(key))}; go on with each by itself,"
+                f" for example resume={run}"
             )
 
 

@@ -228,8 +228,9 @@ def same(run: Path, task: Task, config: Config) -> None:
     """Raises RunError unless this is the task that a run of this config began with, as far as its folder tells."""
     if not (run / "run.json").exists():
         return
-    store.task_of(run)  # facts that are none are said before they are compared
-    if what := facts.difference(store.stored(run)["task"], facts.of_task(task), isinstance(config.model, Lagrangian)):
+    began = store.stored(run)["task"]
+    facts.to_task(began, str(run / "run.json"))  # facts that are none are said before they are compared
+    if what := facts.difference(began, facts.of_task(task), isinstance(config.model, Lagrangian)):
         raise RunError(f"the task of {run / 'config.yaml'} is not that of run.json, with which it began: {what}")
 
 

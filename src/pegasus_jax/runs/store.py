@@ -348,9 +348,8 @@ def stored(run: Path) -> dict[str, Any]:
         raise RunError(f"{path} cannot be read: {error.strerror}") from error
     except ValueError as error:
         raise RunError(f"{path} is damaged; without it, resume={run} writes a new one") from error
-    if not isinstance(found, dict) or not isinstance(found.get("commands", []), list):
-        raise RunError(f"{path} is damaged; without it, resume={run} writes a new one")
-    if not isinstance(found.get("task", {}), dict):
+    kinds = {"commands": list, "task": dict}
+    if not isinstance(found, dict) or not all(isinstance(found.get(name, of()), of) for name, of in kinds.items()):
         raise RunError(f"{path} is damaged; without it, resume={run} writes a new one")
     if "task" not in found:
         versions = found.get("versions")

@@ -41,10 +41,9 @@ def length(given: Config, task: Task) -> list[str]:
     """
     if given.task != GYM:
         return []
-    from pegasus_envs.gym_plant import make_env
+    from pegasus_envs.gym_plant import make_env, own_limit
 
-    spec = make_env(given.env or "", given.env_args).spec
-    own = spec.max_episode_steps if spec else None
+    own = own_limit(make_env(given.env or "", given.env_args))
     if own is not None and own < task.horizon:
         return [
             f"horizon={task.horizon}, and the environment's own limit ends each episode after {own} periods: each that"
