@@ -272,7 +272,10 @@ def test_a_search_that_loses_what_it_found_ends_with_what_it_had_before_it_refin
 
 @pytest.mark.parametrize(
     ("own", "other", "stuck", "taken"),
-    [(2, 1, False, True), (1, 2, False, False), (1, 1, False, True), (1, np.nan, False, False), (1, 2, True, True)],
+    [
+        *((2, 1, False, True), (1, 2, False, False), (1, 1, False, True), (1, 2, True, True)),
+        *((1, np.nan, False, False), (1, np.nan, True, False), (np.nan, 1, False, True)),
+    ],
 )
 def test_a_fresh_policy_is_taken_where_it_costs_no_more_or_the_last_search_found_nothing(own, other, stuck, taken):
     """Of two equal ones the fresh one, because a flat cost leads nowhere; what is not a number never."""
@@ -282,6 +285,19 @@ def test_a_fresh_policy_is_taken_where_it_costs_no_more_or_the_last_search_found
     after, info = found.run(jax.random.key(0), learner, 1.0, steps=1, fresh=jnp.full((2, 3), float(other)))
     assert np.array_equal(after.params, np.full(3, other if taken else own))
     np.testing.assert_allclose(info.objective, 3 * float(other if taken else own) ** 2)
+
+
+@pytest.mark.parametrize("init", ["better", "raced", "fresh"])
+def test_a_policy_whose_particles_go_to_infinity_is_left_behind(init):
+    """Its cost is not a number, and that of a fresh one is: what a search found is not given up for it."""
+
+    def value(params, posterior, scenarios, row):
+        return jnp.where(jnp.abs(params[0]) > 5, jnp.nan, 0.1 * (params[0] - 1) ** 2)
+
+    found, learner = on_table(search_table(100, init=init, refine=50), optax.adam(0.05), STILL, value)
+    learner = learner._replace(params=jnp.full(3, 10.0))
+    learner, _ = found.run(jax.random.key(0), learner, 1.0, steps=100, fresh=jnp.zeros((2, 3)))
+    np.testing.assert_allclose(learner.params[0], 1, atol=0.1)
 
 
 def test_a_fresh_policy_that_a_table_needs_and_iterations_that_it_lacks_are_errors():

@@ -93,10 +93,11 @@ def after(
     """What a row makes of the cost and gradient of what it visited -> (learner, cost of its parameters, skipped)."""
     (params, state), finite, steps_now = learner, is_finite((value, gradient)), row.action == STEP
     # Which policy is taken says `SearchTable.candidate`. A tie leaves CURRENT: where a cost is flat nothing else does.
-    older = ~(state.last < value)
+    # What is not a number, because a particle went to infinity, loses.
+    lost = jnp.isnan(state.last)
+    older, less = (value <= state.last) | lost, (value < state.last) | lost
     # A fresh policy is also where a search begins that is to find another than the given one.
-    fresh = (value <= state.last) | state.no_improvement | (state.worked > 0)
-    less = (value < state.last) | jnp.isnan(state.last)
+    fresh = older | (state.no_improvement | (state.worked > 0)) & ~jnp.isnan(value)
     taken = jnp.stack([True, fresh, True, less, older, older])[row.candidate] | steps_now
     params, state = optax.tree.where(taken, visited, params), returned(row, taken, state)
     now = TrainState(params, state.optimizer)

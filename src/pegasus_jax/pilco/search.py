@@ -66,8 +66,9 @@ def propagate(
     """H steps from the Gaussian `start` (mean [D], cov [D, D]); dynamics and policy must have `moments`.
 
     `std` [D] is that of the model's observation noise, which enters as in a rollout of particles: on what the policy
-    sees from the second step on, and, by the factor `noise.state`, on the state itself, independently. The original has
-    neither; the authors' sparse-spectrum model adds its noise to the state (its factor is 1, the policy's 0).
+    sees from the second step on, and, by the factor `noise.state`, on the state itself: independently, where a particle
+    has one draw for both. The original has neither; the authors' sparse-spectrum model adds its noise to the state (its
+    factor is 1, the policy's 0).
     """
     one = partial(step, dynamics=dynamics, policy=policy, angles=angles)
     variance = jax.lax.stop_gradient(std) ** 2
@@ -135,7 +136,7 @@ def analytic(
             """These, or the fresh ones where those cost no more."""
             one = jax.tree.map(lambda leaf: leaf[0], fresh)
             own, other = jax.vmap(value)(jax.tree.map(lambda *leaves: jnp.stack(leaves), params, one))
-            return optax.tree.where(other <= own, one, params)
+            return optax.tree.where((other <= own) | jnp.isnan(own), one, params)
 
         new = jnp.asarray(first) == 0
         if restart:
