@@ -323,8 +323,8 @@ def _() -> Any:
     each = pg.costs.of_particles(pg.costs.widened(cost, 2.0))(x)
     stopped = pg.costs.until_stop(each, x, lambda x: x[0] > 1, 1.0)
     assert each.shape == stopped.shape == (H, K)
-    assert pg.costs.of_matched(cost)(x).shape == pg.costs.of_narrow(cost, (0,))(x).shape == (H, 1)
-    assert pg.costs.of_particles_mean(cost)(x).shape == (H, 1)
+    assert pg.costs.of_matched(cost)(x).shape == (H, 1)
+    assert pg.costs.of_narrow(cost, (0,))(x).shape == (H, K)
     by_nodes, closed = pg.costs.expected_by_nodes(cost.of_state), pg.costs.expectation(cost)
     return by_nodes(X, jnp.eye(D)), closed(X, jnp.eye(D)), pg.costs.mean(stopped), pg.costs.total(each)
 

@@ -229,6 +229,27 @@ def test_a_cost_that_is_only_a_function_is_widened_as_well(stop):
         np.testing.assert_allclose(own, known, atol=near)
 
 
+@pytest.mark.parametrize("refining", [True, None])
+def test_a_particle_that_is_over_has_no_part_in_what_the_others_cost(refining):
+    """Half of them end at once, and cost `stop_cost` from then on; the others are at the goal, alone or wide apart."""
+    free = Cost(lambda x: jnp.where(jnp.abs(x[0]) > 1, 1.0, 0.0))
+    task = cart(horizon=4)._replace(stop=lambda x: jnp.abs(x[0]) > 1, stop_cost=0.5, cost=free, angles=(1,))
+    x = jnp.zeros((4, 10, 2)).at[:, :5, 0].set(3.0).at[:, ::2, 1].set(0 if refining else 3.0)
+    asked = None if refining is None else jnp.asarray(refining)
+    found = costs_of(config.Search(cost_estimator="gaussian", matching="narrow"), task)(asked, None)(x)
+    np.testing.assert_allclose(jnp.mean(found, 1), [0.5, 0.25, 0.25, 0.25])
+
+
+def test_a_model_that_diverges_beyond_an_end_spoils_no_search():
+    """What has ended stays where it is: a model says nothing of what comes then."""
+    runaway = known(PENDULUM._replace(a=1e3 * PENDULUM.a), noise_std=0.01)
+    task = cart(horizon=40)._replace(stop=lambda x: jnp.abs(x[0]) > 1)
+    exp = compose(tiny(search__steps=5), task, dynamics=runaway)
+    _, info = jax.jit(exp.search)(exp.init(jax.random.key(0)))
+    assert info.skipped == 0
+    assert np.isfinite(info.objective).all()
+
+
 def test_the_matched_cost_of_any_function_is_that_of_its_nodes():
     """Near the closed form of the same cost, which was not asked for; and of no width."""
     task, search = cart(horizon=3), config.Search(cost_estimator="gaussian", cost_width_start=1)

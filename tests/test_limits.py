@@ -46,9 +46,10 @@ def path(*positions: float) -> np.ndarray:
 
 
 def test_the_probability_is_the_share_of_trajectories_that_leave_the_limits():
-    """Once or often, on either side; one that begins outside says nothing of its policy, and does not count."""
+    """Once or often, on either side, or to infinity; one that begins outside says nothing of its policy."""
     paths = [path(0, 0.9, 0), path(0, 1.1, 0), path(0, -1.1, -2), path(1.2, 1.3, 0), path(0, 1.0, 0)]
     assert limits.probability(jnp.concatenate(paths, 1), RAIL) == pytest.approx(2 / 4)
+    assert limits.probability(jnp.concatenate([*paths, path(0, 0.5, np.nan)], 1), RAIL) == pytest.approx(3 / 5)
     assert limits.probability(path(1.2, 0, 0), RAIL) == 0
 
 
@@ -129,14 +130,17 @@ def test_a_search_without_a_constraint_has_no_multiplier():
 
 def test_a_particle_stays_where_it_is_over():
     """Grossly beyond the limit, or stopped; the others move as the model says, one by one or all at once."""
-    beyond, stopped = limits.over(RAIL, None), limits.over(RAIL, lambda x: x[1] > 3)
-    assert [bool(beyond(jnp.array([p, 0.0]))) for p in (0.0, 1.5, 2.5, -2.5)] == [False, False, True, True]
-    drift = network()._replace(apply=lambda posterior, draw, x, u: Prediction(x + 1, jnp.ones(2)))
-    apply = limits.held(drift, stopped).apply
-    x, none = jnp.array([[0.0, 1.0], [2.5, 1.0], [0.0, 4.0]]), jnp.zeros((3, 1))
-    expected = np.array([[1.0, 2.0], [0.0, 0.0], [0.0, 0.0]])
-    np.testing.assert_array_equal(for_particles(apply)(None, none, x, none).mean, expected)
-    np.testing.assert_array_equal([apply(None, none[0], row, none[0]).mean for row in x], expected)
+    drift = network()._replace(apply=lambda posterior, draw, x, u: Prediction(jnp.ones(2), jnp.ones(2)))
+    x, none = jnp.array([[0.0, 1.0], [1.5, 1.0], [2.5, 1.0], [-2.5, 1.0], [0.0, 4.0]]), jnp.zeros((5, 1))
+    for constraint, stop, moves in (
+        (RAIL, None, [1, 1, 0, 0, 1]),
+        (None, lambda x: x[1] > 3, [1, 1, 1, 1, 0]),
+        (RAIL, lambda x: x[1] > 3, [1, 1, 0, 0, 0]),
+        (None, None, [1, 1, 1, 1, 1]),
+    ):
+        apply, expected = limits.held(drift, constraint, stop).apply, np.outer(moves, [1, 1])
+        np.testing.assert_array_equal(for_particles(apply)(None, none, x, none).mean, expected)
+        np.testing.assert_array_equal([apply(None, none[0], row, none[0]).mean for row in x], expected)
 
 
 SLOW = Constraint(lambda x: jnp.array([jnp.abs(x[1]) / 0.5 - 1]))  # at most 0.5 m/s

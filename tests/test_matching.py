@@ -77,8 +77,8 @@ def test_a_cost_is_of_the_gaussian_or_of_the_particles(spread):
     cost = Cost(quadratic, lambda mean, cov: jnp.float32(0.7))
     x, _ = cloud(0, spread)
     found = costs.of_narrow(cost, ANGLES)(x[None])
-    expected = 0.7 if spread < 1 else np.mean([quadratic(row) for row in x])
-    np.testing.assert_allclose(found, [[expected]], rtol=1e-5)
+    expected = [0.7] * K if spread < 1 else [quadratic(row) for row in x]
+    np.testing.assert_allclose(found, [expected], rtol=1e-5)
 
 
 def test_one_particle_has_no_covariance():

@@ -45,7 +45,7 @@ class Matching(NamedTuple):
     """What search.matching names, for the angles of a task."""
 
     particles: Callable[[tuple[int, ...]], matching.Match]  # what becomes of the particles of each step
-    cost: Callable[[Cost, tuple[int, ...]], Callable[[Array], Array]]  # -> costs [H, 1] of states [H, K, D]
+    cost: Callable[[Cost, tuple[int, ...]], Callable[[Array], Array]]  # -> costs [H, K] or [H, 1] of x [H, K, D]
 
 
 MATCHINGS = {
@@ -55,7 +55,7 @@ MATCHINGS = {
 }
 
 # What an episode keeps, such as a goal, is not to be redrawn, nor averaged over before the cost is.
-UNMATCHED = Matching(lambda _: matching.keep, lambda of, _: cost.of_particles_mean(of))
+UNMATCHED = Matching(lambda _: matching.keep, lambda of, _: cost.of_particles(of))
 
 # (key, policy parameters, posterior) -> (rollout, cost [H, K])
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]
@@ -101,14 +101,14 @@ def search_of(
     if search.visited_starts:
         around = jnp.asarray(task.start_mean, float)
         searched = blocks._replace(start=beside_visited(blocks.start, search.visited_starts, task.angles, around))
-    pieces: dict[str, Any] = dict(dynamics=dynamics, policy=policy, noise=noise)
+    pieces: dict[str, Any] = dict(policy=policy, noise=noise)
+    pieces["dynamics"] = limited.held(dynamics, task.constraint, task.stop)
     # A particle's cost is 1 / K of the objective.
     limit = None if (most := search.particle_grad_limit) is None else most / search.particles
     objective_of, ascend = objective, None
     if (constraint := task.constraint) is not None:
         objective_of = partial(limited.constrained, constraint=constraint)
         ascend = partial(limited.ascend, bound=constraint.bound)
-        pieces["dynamics"] = limited.held(dynamics, limited.over(constraint, task.stop))
     match = named.particles(task.angles)
     costs = costs_of(search, task)
     refines = search.refine_fraction > 0
@@ -243,7 +243,7 @@ def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Arr
         if search.cost_estimator != "gaussian":
             return until_stop(task, cost.of_particles(now))
         matched = matching_of(search, task).cost(now, task.angles)
-        return until_stop(task, either(refining, cost.of_particles_mean(now), matched))
+        return until_stop(task, either(refining, cost.of_particles(now), matched))
 
     return costs
 

@@ -21,7 +21,6 @@ __all__ = [
     "of_matched",
     "of_narrow",
     "of_particles",
-    "of_particles_mean",
     "saturating",
     "total",
     "until_stop",
@@ -145,12 +144,6 @@ def of_particles(cost: Cost) -> Callable[[Array], Array]:
     return jax.vmap(jax.vmap(partial(of, cost)))
 
 
-def of_particles_mean(cost: Cost) -> Callable[[Array], Array]:
-    """The mean cost of the particles of each time: x [H, K, D] -> [H, 1], as `of_matched` has its expectation."""
-    each = of_particles(cost)
-    return lambda x: jnp.mean(each(x), 1, keepdims=True)
-
-
 def until_stop(costs: Array, x: Array, stop: Callable[[Array], Array], stop_cost: float) -> Array:
     """Costs [H, K] or [H, 1] of particles x [H, K, D] that end where `stop` says; after that a step costs `stop_cost`.
 
@@ -169,8 +162,8 @@ def of_matched(cost: Cost) -> Callable[[Array], Array]:
 
 
 def of_narrow(cost: Cost, angles: tuple[int, ...]) -> Callable[[Array], Array]:
-    """`of_matched`, and at the times at which the particles are `matching.wide` the mean of their own costs."""
-    own, matched = of_particles_mean(cost), of_matched(cost)
+    """`of_matched`, and at the times at which the particles are `matching.wide` their own: x [H, K, D] -> [H, K]."""
+    own, matched = of_particles(cost), of_matched(cost)
 
     def each(x: Array) -> Array:
         far = wide(x, angles)[:, None]

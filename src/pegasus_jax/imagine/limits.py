@@ -41,9 +41,9 @@ def _numbers(constraint: Constraint) -> Callable[[Array], Array]:
 def probability(x: Array, constraint: Constraint) -> Array:
     """[] the share of the trajectories x [H+1, K, D] that break the constraint after their first state.
 
-    One that begins beyond the limit says nothing of its policy, and does not count.
+    One that begins beyond the limit says nothing of its policy, and does not count; one that goes to infinity does.
     """
-    over = margin(x, constraint) > 0
+    over = ~(margin(x, constraint) <= 0)
     return jnp.sum(jnp.any(over[1:], 0) & ~over[0]) / jnp.maximum(jnp.sum(~over[0]), 1)
 
 
@@ -87,17 +87,21 @@ def constrained(
     return value, probability(x, constraint)
 
 
-def over(constraint: Constraint, stop: Callable[[Array], Array] | None) -> Callable[[Array], Array]:
-    """Where a particle is over, x [D] -> bool: it stopped, or is grossly beyond the limit."""
-    gross = lambda x: margin(x, constraint) > GROSS  # noqa: E731
-    return gross if stop is None else lambda x: gross(x) | (stop(x) > 0.5)
-
-
-def held(dynamics: Dynamics, over: Callable[[Array], Array]) -> Dynamics:
-    """The same model, in which a particle stays where it is `over`, x [D] -> bool.
+def held(dynamics: Dynamics, constraint: Constraint | None, stop: Callable[[Array], Array] | None) -> Dynamics:
+    """The same model, in which a particle stays where it stopped, or is grossly beyond the limit.
 
     A model says nothing of what comes then, and may send particles to infinity.
     """
+    ends: list[Callable[[Array], Array]] = []
+    if constraint is not None:
+        ends.append(lambda x: margin(x, constraint) > GROSS)
+    if stop is not None:
+        ends.append(lambda x: stop(x) > 0.5)
+    if not ends:
+        return dynamics
+
+    def over(x: Array) -> Array:
+        return jnp.any(jnp.stack([end(x) for end in ends]))
 
     def still(x: Array, change: Prediction) -> Prediction:
         return Prediction(*(jnp.where(over(x), 0.0, part) for part in change))
