@@ -90,6 +90,21 @@ def test_a_degenerate_covariance_gives_finite_factor_and_gradient(name, factor_a
     np.testing.assert_allclose(factor @ factor.T, cov, atol=2e-3 * float(jnp.max(jnp.abs(cov))) + 1e-6)
 
 
+def test_what_does_not_vary_yet_has_no_part_in_the_gradient():
+    """As a control that waits since the start: the other columns' slopes are what they are without it."""
+
+    def total(x, weight):
+        return jnp.sum(weight * cholesky(mean_and_cov(x)[1]))
+
+    noise = np.random.default_rng(4)
+    others, weight = jnp.asarray(noise.normal(size=(20, 2)), jnp.float32), jnp.asarray(noise.normal(size=(3, 3)))
+    still = jnp.insert(others, 1, 0.3, axis=1)
+    found = jax.grad(total)(still, weight)
+    without = jax.grad(total)(others, weight[jnp.array([0, 2])][:, jnp.array([0, 2])])
+    np.testing.assert_allclose(found[:, jnp.array([0, 2])], without, rtol=1e-4, atol=1e-5)
+    assert jnp.abs(found[:, 1]).max() < 10
+
+
 of_matched = jax.jit(jax.value_and_grad(lambda x, z: jnp.sum(jnp.cos(match(x, z)))))
 
 

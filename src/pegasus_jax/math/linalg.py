@@ -22,13 +22,15 @@ def _cholesky_jvp(primals: tuple[Array], tangents: tuple[Array]) -> tuple[Array,
     """dL = L phi(L^-1 dS L^-T), where phi keeps the lower half and half of the diagonal (Murray 2016, eq. 8).
 
     In closed form, because the derivative of the elimination below, step by step, takes twice as long to compile. A
-    floored pivot is a constant: its column is then linear in S, and phi keeps all of its place on the diagonal.
+    floored pivot is a constant: its column is then linear in S, and phi keeps all of its place on the diagonal. What
+    does not vary at all, as a control that waits since the start, has no slope there: it would be 1 / 0.
     """
     (cov,), (change,) = primals, tangents
     lower, inverse = _factor(cov)
     pivots = 1 / jnp.diagonal(inverse)
     floored = jnp.diagonal(lower) < pivots * (1 - 1e-5)
     keep = jnp.tril(jnp.ones_like(cov), -1) + jnp.diag(jnp.where(floored, 1.0, 0.5).astype(cov.dtype))
+    keep = jnp.where(jnp.diagonal(cov) > 0, keep, 0)  # of columns
     return lower, (jnp.tril(lower, -1) + jnp.diag(pivots)) @ (keep * (inverse @ change @ inverse.T))
 
 
@@ -49,7 +51,8 @@ def mean_and_cov(x: Array) -> tuple[Array, Array]:
     """Mean [D] and unbiased covariance [D, D] of particles x [K, D]. Raises ValueError for fewer than 2."""
     if len(x) < 2:
         raise ValueError(f"x of shape {x.shape} is {len(x)} particles; a covariance, as of moment matching, needs 2")
-    mean = jnp.mean(x, 0)
+    first = jax.lax.stop_gradient(x[0])  # so that what does not vary has a variance of 0, and none of rounding
+    mean = first + jnp.mean(x - first, 0)
     centered = x - mean
     return mean, centered.T @ centered / (x.shape[0] - 1)
 
