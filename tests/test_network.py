@@ -29,6 +29,12 @@ def test_it_is_the_network_of_the_docstring(hidden, masked):
     np.testing.assert_allclose(network.apply(params, x, masks), forward(params, x, masks), atol=1e-5)
 
 
+def test_all_of_it_has_the_precision_that_was_asked_for(x64):
+    """The kernels too: else a gradient of 64 bits would be one of 32."""
+    params = MLP((5,), 2).init(jax.random.key(0), jnp.zeros(3), [None, None])
+    assert {leaf.dtype for leaf in jax.tree.leaves(params)} == {np.dtype(np.float64)}
+
+
 def test_every_row_may_have_its_own_mask():
     network = MLP((5,), 2)
     params = network.init(jax.random.key(0), jnp.zeros(3), [None, None])

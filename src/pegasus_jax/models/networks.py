@@ -72,7 +72,8 @@ class MLP(nn.Module):
         for i, width in enumerate((*self.hidden, self.outputs)):
             mask = masks[i]
             x = x if mask is None else x * mask
-            x = nn.Dense(width, kernel_init=kernel_init, bias_init=_small_uniform, name=f"layer_{i}")(x)
+            kind: dict[str, Any] = dict(param_dtype=jnp.result_type(float), name=f"layer_{i}")
+            x = nn.Dense(width, kernel_init=kernel_init, bias_init=_small_uniform, **kind)(x)
             if i < len(self.hidden):
                 x = ACTIVATIONS[self.activation](x)
         return x
