@@ -132,6 +132,29 @@ def test_a_driver_that_is_silent_or_gone_stops_the_motors(sides: Any, served: Se
     assert "motors stopped: no control for 25 periods" in capsys.readouterr().out
 
 
+def test_a_connection_finds_out_that_the_other_computer_is_gone(sides: Any, served: Served) -> None:
+    robot = driver(sides, served)
+    assert robot._robot._socket.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
+    robot.close()
+
+
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_signal_stops_the_motors(sides: Any, name: str) -> None:
+    program = [sys.executable, "-u", str(EXAMPLE / "robot_side.py"), "port=0", "silence=1000"]
+    with subprocess.Popen(program, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as side:
+        assert side.stdout is not None
+        found = re.search(r":(\d+), a period", side.stdout.readline())
+        assert found
+        robot = sides[2].Remote(port=int(found[1]))
+        robot.reset()
+        robot.step(np.array([1.0]))
+        side.send_signal(signal.Signals[name])
+        said, ended = side.communicate(timeout=30)
+        robot.close()
+    assert "motors stopped: this side ends" in said
+    assert ended == "terminated\n"
+
+
 @pytest.mark.parametrize(
     ("question", "says"),
     [
@@ -139,6 +162,7 @@ def test_a_driver_that_is_silent_or_gone_stops_the_motors(sides: Any, served: Se
         ({"do": "control", "number": 2, "control": [0.1, 2.1]}, "is not from"),
         ({"do": "control", "number": 2, "control": [0.1, float("nan")]}, "is not from"),
         ({"do": "control", "number": 2, "control": [0.1]}, "ValueError: zip"),
+        ({"do": "control", "number": 2, "control": [10**400, 0.1]}, "OverflowError"),
         ({"do": "control", "number": 2}, "KeyError: 'control'"),
         ({"do": "dance", "number": 2}, "KeyError: 'dance'"),
     ],

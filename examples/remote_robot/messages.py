@@ -22,6 +22,12 @@ import time
 
 PROTOCOL = 1
 LONGEST = 2**16  # bytes of a line
+# A driver whose computer is off says nothing more: without these it would keep the robot's side for itself.
+ALIVE = {
+    "TCP_KEEPIDLE": 5,
+    "TCP_KEEPINTVL": 2,
+    "TCP_KEEPCNT": 5,
+}  # seconds, seconds, times; as far as a system has them
 
 
 class Connection:
@@ -29,6 +35,10 @@ class Connection:
 
     def __init__(self, connected: socket.socket):
         connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # a control does not wait for more
+        connected.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in ALIVE.items():
+            if hasattr(socket, name):
+                connected.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         self._socket, self._rest = connected, b""
 
     def send(self, message: dict) -> None:

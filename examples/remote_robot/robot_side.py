@@ -80,7 +80,7 @@ class Side:
         try:
             do = {"reset": self.reset, "control": self.control, "stop": self.ended}[asked["do"]]
             answer |= do(asked)
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, ArithmeticError) as error:
             self.last = None
             self.stop("a question that cannot be answered")
             answer["error"] = f"{type(error).__name__}: {error}"
@@ -127,7 +127,9 @@ def main(*words: str) -> None:
     given = {"host": "127.0.0.1", "port": "5555", "period": "0.05", "silence": "5"}
     given |= dict(word.split("=", 1) for word in words)
     side = Side(Arm(), float(given["period"]), int(given["silence"]))
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit("terminated"))
+    for name in ("SIGTERM", "SIGHUP"):  # Windows has no SIGHUP; nohup leaves it ignored
+        if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) != signal.SIG_IGN:
+            signal.signal(getattr(signal, name), lambda *_: sys.exit("terminated"))
     with socket.create_server((given["host"], int(given["port"]))) as server:
         host, port = server.getsockname()
         print(f"waiting for a driver at {host}:{port}, a period of {side.period:g} s", flush=True)
