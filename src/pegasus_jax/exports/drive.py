@@ -6,14 +6,16 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from pegasus_jax import interrupt, tasks
 from pegasus_jax.checks import ConfigError, RunError, check_range
-from pegasus_jax.episode import Episode, costs, drive, mean_cost
+from pegasus_jax.episode import Episode, costs, drive, mean_cost, padded
 from pegasus_jax.exports.asked import asking
 from pegasus_jax.exports.watchdog import Watchdog
 from pegasus_jax.exports.write import export
@@ -21,6 +23,7 @@ from pegasus_jax.runs import driven, restore, store
 from pegasus_jax.runs.collect import failed
 from pegasus_jax.runs.files import write_whole
 from pegasus_jax.task import Task
+from pegasus_jax.tasks.terms import asked_names
 from pegasus_jax.types import Trajectory
 
 SLACK = 0.1  # of a period, by which a control may follow the one before it too late
@@ -77,13 +80,14 @@ def drives(
     print(f"preparing the controller of trial {int(state.trial)}; nothing moves yet", file=sys.stderr, flush=True)
     with tempfile.TemporaryDirectory() as folder:
         control = runpy.run_path(str(export(run, int(state.trial), out=Path(folder) / "policy.py")))["Controller"]()
+    cost_of = _counting(task)
     gc.freeze()  # nothing that is there is looked at by the garbage collector while the robot moves
     try:
         with driven.locked(run):  # two would write the same log
             for number in range(episodes):
                 control.reset()
                 with interrupt.held():  # a log is written before a signal is heard again
-                    done = _driven(run, task, control, int(state.trial), seed + number, limit)
+                    done = _driven(run, task, control, cost_of, int(state.trial), seed + number, limit)
                 yield done
     finally:
         tasks.close(task)
@@ -98,7 +102,28 @@ def _announced(task: Task, trial: int, limit: float) -> str:
     return f"the policy of trial {trial} drives {task.name}: {', '.join(task.state_names)} -> {sent}; {period}"
 
 
-def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy: int, seed: int, limit: float) -> Drive:
+def _counting(task: Task) -> Callable[[Trajectory], np.ndarray]:
+    """The costs [L] of an episode of L <= H periods, compiled now: a robot that has moved waits to be closed."""
+    jitted = jax.jit(partial(costs, task))
+
+    def cost_of(rows: Trajectory) -> np.ndarray:
+        return np.asarray(jitted(padded(rows, task.horizon)), np.float32)[: len(rows.u)]
+
+    states, controls = len(task.state_names), len(task.control_names)
+    memory: Any = np.zeros(len(task.memory.names), np.float32) if asked_names(task) else None
+    cost_of(Trajectory(*(np.zeros(shape, np.float32) for shape in ((1, states), (0, controls), 0)), memory=memory))  # type: ignore[arg-type]
+    return cost_of
+
+
+def _driven(
+    run: Path,
+    task: Task,
+    control: Callable[[Any], np.ndarray],
+    cost_of: Callable[[Trajectory], np.ndarray],
+    policy: int,
+    seed: int,
+    limit: float,
+) -> Drive:
     """One episode, logged. Raises RunError, or the signal, where it failed."""
     log = driven.path_of(run, 1 + max(store.numbered(run / driven.FOLDER, ".npz"), default=0))
     times: list[float] = []
@@ -106,9 +131,10 @@ def _driven(run: Path, task: Task, control: Callable[[Any], np.ndarray], policy:
     act, memories = asking(control, task, seed)
 
     def save(ran: Episode) -> Drive:
-        ran = ran._replace(trajectory=ran.trajectory._replace(memory=memories[0] if memories else None))
+        first: Any = np.asarray(memories[0], np.float32) if memories else None
+        ran = ran._replace(trajectory=ran.trajectory._replace(memory=first))
         drove = len(ran.trajectory.u) > 0
-        cost = np.asarray(costs(task, ran.trajectory) if drove else [], np.float32)
+        cost = cost_of(ran.trajectory) if drove else np.zeros(0, np.float32)
         kept = ran._replace(trajectory=ran.trajectory._replace(cost=cost))  # type: ignore[arg-type]
         done = Drive(
             log,
