@@ -84,7 +84,7 @@ def test_a_robot_gets_no_control_that_changes_by_more(exploring):
         sent.append(np.array(u))
         return x, np.array(u), ""
 
-    robot = SimpleNamespace(reset=lambda seed: x, step=step, close=lambda: None)
+    robot = SimpleNamespace(reset=lambda seed: x, step=step, close=lambda: None, rest=lambda: None)
     exp = compose(tiny(**WORDS), cart()._replace(plant=None, environment=robot))
     assert exp.drive is not None
     wild = jax.tree.map(lambda leaf: 20 * leaf, exp.policy.init(jax.random.key(0)))

@@ -30,6 +30,7 @@ class Robot(NamedTuple):
     reset: Any
     step: Any
     close: Any = lambda: None
+    rest: Any = lambda: None
 
 
 def backwards():

@@ -63,6 +63,9 @@ class Arm(gymnasium.Env):
                 if os.environ["HANGS"] == "gently":
                     raise
 
+    def rest(self):
+        note("rest")
+
     def close(self):
         note("close")
 
@@ -129,7 +132,7 @@ def newest(home: Path) -> dict[str, np.ndarray]:
 def test_a_robot_is_driven_by_the_policy_at_its_period(home: Path) -> None:
     done = driven(home, "episodes=2", "seconds=0.3", "trial=1", TRACES="1")
     moving = done.asked[done.asked.index("reset") :]  # nothing is traced any more: the last control stays in force
-    assert (done.code, moving) == (0, ["reset", "reset", "close"]), done.err
+    assert (done.code, moving) == (0, ["reset", "rest", "reset", "rest", "close"]), done.err
     said = "the policy of trial 1 drives driven_robot:Driven-v0: x0, x1 -> u0 from -2 to 2; every 0.02 s for 0.3 s"
     before_motion = [*done.err.splitlines()]
     assert before_motion[-5:] == [
@@ -203,6 +206,7 @@ def test_ctrl_c_closes_the_robot_and_its_rows_are_kept(home: Path) -> None:
 class Slow(NamedTuple):
     reset: Any
     step: Any
+    rest: Any = None
 
 
 def clocked(waits: list[float], period: float) -> np.ndarray:

@@ -188,7 +188,22 @@ class Two(Base):
     action_space = gymnasium.spaces.Box(-1, 1, (2,))
 
 
-CLASSES = (Terminates, Truncates, Breaks, Swallows, Buffer, Whole, Two)
+class Rests(Terminates):
+    """Its rest is called `rested` times, and fails the third time."""
+
+    rested = 0
+
+    def rest(self) -> None:
+        Rests.rested += 1
+        if Rests.rested == 3:
+            raise OSError("the brake does not close")
+
+
+class Restless(Base):
+    rest = 0.5  # of a user's own, and no method
+
+
+CLASSES = (Terminates, Truncates, Breaks, Swallows, Buffer, Whole, Two, Rests, Restless)
 for made in CLASSES:
     gymnasium.register(f"{made.__name__}-v0", made)
 
@@ -201,6 +216,18 @@ def test_an_end_ends_the_episode_and_no_row_is_invented(made: type, ended: str) 
         assert (ran.ended, ran.error) == (ended, None)
         np.testing.assert_array_equal(ran.trajectory.x[:, 0], [0, 1, 2, 3])
         assert ran.trajectory.u.shape == (3, 1)
+
+
+def test_an_environment_rests_after_an_episode_and_may_have_no_way_to() -> None:
+    """Else the last control stays in force while a model is fitted. What it raises is an error of that episode."""
+    task = task_of("Rests-v0", 1)
+    for horizon, ended in ((2, "horizon"), (9, "terminated"), (2, "error")):
+        ran = episode.drive(0, lambda t, x: np.ones(1), task._replace(horizon=horizon))
+        assert (ran.ended, len(ran.trajectory.u)) == (ended, min(horizon, 3))
+    assert (str(ran.error), Rests.rested) == ("the brake does not close", 3)
+    task.environment.rest()  # it was closed, and is not opened for that
+    assert Rests.rested == 3
+    assert episode.drive(0, lambda t, x: np.ones(1), task_of("Restless-v0", 1)).error is None
 
 
 def test_an_environment_of_another_number_of_controls_gets_none() -> None:

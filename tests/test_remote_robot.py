@@ -108,6 +108,10 @@ def test_it_is_an_environment_that_knows_itself(sides: Any, served: Served) -> N
         assert ended == [False, False]
         times.append(about["time"])
     assert np.all(np.array(times) - times[0] > 0.02 * np.arange(4) - 1e-3)  # the robot's side keeps the period
+    robot.rest()
+    assert served.stopped(within=0.0)
+    np.testing.assert_allclose(robot.reset(seed=4)[0], [4, 4])
+    robot.step(np.array([1.0, 1.0]))
     robot.close()
     assert served.stopped()
 

@@ -51,6 +51,8 @@ class EnvPlant(NamedTuple):
     step: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, str]]
     """control [U] -> (x [D], the control as it was sent [U], "terminated", "truncated" or "")"""
     close: Callable[[], None]
+    rest: Callable[[], None] = lambda: None
+    """after an episode that ended without an error: no control comes until the next reset, maybe minutes later"""
 
 
 _opened: dict[tuple[str, tuple[str, ...]], gymnasium.Env] = {}
@@ -248,7 +250,18 @@ def env_plant(
             )
         return observed(seen, states, names), sent, "terminated" if terminated else "truncated" if truncated else ""
 
-    return EnvPlant(reset, step, lambda: close_env(name, arguments))
+    def rest() -> None:
+        env = _opened.get((name, arguments))  # one that a watchdog has closed is not opened for this
+        if env is None:
+            return
+        try:
+            stop = env.get_wrapper_attr("rest")
+        except AttributeError:
+            return
+        if callable(stop):
+            stop()
+
+    return EnvPlant(reset, step, lambda: close_env(name, arguments), rest)
 
 
 def first(answer: Any) -> Any:

@@ -50,12 +50,16 @@ class Remote(gymnasium.Env):
         answer = self._ask({"do": "control", "control": np.asarray(control, float).tolist()}, self.timeout)
         return np.array(answer["observation"]), 0.0, False, False, {"time": answer["time"]}
 
+    def rest(self):
+        """Stop the motors: no control comes until the next reset."""
+        self.number += 1
+        self._ask({"do": "stop"}, 1.0)
+
     def close(self):
         """Stop the motors, as far as the connection allows; the robot stops them by itself when it ends."""
         if self._robot is not None:
-            self.number += 1
             with contextlib.suppress(OSError, ValueError):
-                self._ask({"do": "stop"}, 1.0)
+                self.rest()
             self._let_go()
 
     def _ask(self, question, seconds):

@@ -98,8 +98,9 @@ def drive(seed: int, act: Callable[[int, np.ndarray], Any], task: Task) -> Episo
     """At most H control periods of act(t, x [D]) -> u [U] on the task's environment; its rows are NumPy's, of NaN cost.
 
     `terminated` and `truncated` end it, and so does what the environment raises, an observation that is not finite, and
-    a signal: then `error` says what, the rows so far are kept, and the environment is closed before this returns. A
-    request to stop is looked at before every control. Rows hold the controls as they were sent.
+    a signal: then `error` says what, the rows so far are kept, and the environment is closed before this returns. Else
+    it rests: what follows takes time. A request to stop is looked at before every control. Rows hold the controls as
+    they were sent.
     """
     rows, ended, error, first = [], "horizon", None, None
     try:
@@ -116,6 +117,7 @@ def drive(seed: int, act: Callable[[int, np.ndarray], Any], task: Task) -> Episo
                     # A time limit that is the horizon ends nothing early.
                     ended = "horizon" if (over, t + 1) == ("truncated", task.horizon) else over
                     break
+            task.environment.rest()
     except BaseException as raised:
         interrupt.let_go(task.environment.close)
         ended, error = "interrupted" if isinstance(raised, KeyboardInterrupt) else "error", raised

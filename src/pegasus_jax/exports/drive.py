@@ -188,7 +188,11 @@ def timed(environment: Any, period: float, times: list[float], rows: list[Any], 
         rows.append(answer[:2])
         return answer
 
-    return environment._replace(reset=reset, step=step)
+    def rest() -> None:
+        beat()  # it may take as long as a control may
+        environment.rest()
+
+    return environment._replace(reset=reset, step=step, rest=rest)
 
 
 def _write(run: Path, done: Drive, task: Task, policy: int) -> None:
