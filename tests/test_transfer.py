@@ -22,6 +22,7 @@ from pegasus_jax.models.ensemble import ensemble
 from pegasus_jax.models.residual import FURTHEST, differences, on_differences, residual
 from pegasus_jax.runs import begin, check, checkpoint, config_io, logged, restore, store
 from pegasus_jax.runs.train import train
+from pegasus_jax.tasks import priors
 from pegasus_jax.tasks.remembered import remembering
 from pegasus_jax.types import Batch, ModelLearner
 from pegasus_jax.vectorized import for_particles
@@ -165,6 +166,25 @@ def test_a_prior_of_another_kind_of_model_or_size_is_one_line(tmp_path):
     assert "has the state j [rad], j' [rad/s], and cartpole has x [m]" in told(error)
     with pytest.raises(ConfigError, match="there is no such file"):
         tasks.of_config(parse(prior="nowhere.xml", model="log_normal"))
+
+
+def test_a_prior_of_entries_in_another_order_is_one_line(tmp_path):
+    """As far as units tell it: a unit that is not said, or that is spelled in another way, may be the same."""
+    joint, part = "<joint name='{0}' type='{0}'/><geom size='1'/>", "<body>{}</body>"
+    links = part.format(joint.format("slide") + part.format(joint.format("hinge")))
+    motor = "<actuator><motor joint='slide'/></actuator>"
+    (tmp_path / "cart.xml").write_text(f"<mujoco><worldbody>{links}</worldbody>{motor}</mujoco>")
+    config = parse(prior=str(tmp_path / "cart.xml"), model="log_normal")
+    task = tasks.of_config(parse())
+
+    def refused(**words):
+        priors.of_file("prior=cart.xml", replace(config, **words), task)
+
+    with pytest.raises(ConfigError, match=r"cart.xml has hinge \[rad\] where cartpole has .* \[m/s\]: expected the"):
+        refused()
+    refused(observe=("qpos.0", "qvel.0", "qvel.1", "qpos.1"))
+    task = task._replace(state_names=("x", "v", "rate [deg/s]", "angle"))
+    refused()
 
 
 @pytest.mark.slow
@@ -342,6 +362,20 @@ def test_angles_and_periods_of_another_task_are_told(simulator):
     notes = begin.checked(config, task._replace(dt=0.2, control_high=task.control_high / 2))
     assert any("dt of cartpole is 0.1, here 0.2" in note for note in notes)
     assert any("control_high of cartpole is [10], here [5]" in note or "[10.0], here [5.0]" in note for note in notes)
+
+
+def test_a_beginning_has_states_in_the_same_order(simulator):
+    """Numbers and angles are the same where position and speed are exchanged, and a policy takes one for the other."""
+    config = parse(init=str(simulator))
+    task = tasks.of_config(config)
+    x, v, *others = task.state_names
+    for exchanged in ((v, x, *others), tuple(name.partition(" [")[0] for name in (v, x, *others))):
+        with pytest.raises(ConfigError, match=r"is of cartpole with x \[m\], .*, and cartpole has .*the same order"):
+            begin.checked(config, task._replace(state_names=exchanged))
+    renamed = begin.checked(config, task._replace(control_names=("push",)))
+    assert renamed[-1] == f"cartpole has {task.control_names[0]}, here that is push"
+    for nameless in (("x0", "rate of x0", "x2", "atan2(x4, x3)"), ("qpos.0", "qvel.0", "qpos.1", "qvel.1")):
+        assert len(begin.checked(config, task._replace(state_names=nameless, control_names=("u0",)))) == 1
 
 
 @pytest.mark.parametrize(

@@ -5,6 +5,7 @@ RUN/init/config.yaml, run.json, checkpoints/NNNN    of the other run, which may 
 first.py copies the run of explore.policy= in the same way.
 """
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,14 @@ import numpy as np
 from pegasus_jax.checks import ConfigError, RunError, shown
 from pegasus_jax.config import Config, begins_with
 from pegasus_jax.experiment import Experiment
+from pegasus_jax.math.units import parted
 from pegasus_jax.memory import seen_kinds, seen_names
 from pegasus_jax.runs import checkpoint, config_io, logged, restore, store
 from pegasus_jax.task import Task
 from pegasus_jax.types import RunState, TrainState
 
 FOLDER = "init"
+NUMBERED = r"(rate of )?(atan2\()?([xu]|qpos\.|qvel\.)\d+(, x\d+\))?"  # a name that nobody gave
 
 
 def source(init: str) -> tuple[Path, int]:
@@ -88,7 +91,7 @@ def checked(config: Config, task: Task) -> list[str]:
 
 
 def suits(what: str, task: Task, theirs: Task, observed: bool = False, more: str = "") -> None:
-    """Raises ConfigError where another run's policy cannot act on a task: other numbers, or other angles.
+    """Raises ConfigError where another run's policy cannot act on a task: other numbers, angles or order.
 
     With `observed` it is given the observation, and knows itself which of that are angles.
     """
@@ -101,6 +104,18 @@ def suits(what: str, task: Task, theirs: Task, observed: bool = False, more: str
     for its, mine in zip(facts_of(theirs), facts_of(task), strict=True):
         if its != mine:
             raise ConfigError(f"{what} is of {theirs.name} with {its}, and {task.name} has {mine}{more}")
+    for its, mine in zip(_names(theirs), _names(task), strict=True):
+        for form in (lambda name: name, lambda name: parted(name)[0]):  # units may be said by one of them only
+            one, other = [*map(form, its)], [*map(form, mine)]
+            if one != other and sorted(one) == sorted(other):
+                raise ConfigError(
+                    f"{what} is of {theirs.name} with {', '.join(its)}, and {task.name} has {', '.join(mine)}: expected"
+                    " the same order"
+                )
+
+
+def _names(task: Task) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    return task.state_names, task.control_names
 
 
 def otherwise(task: Task, theirs: Task) -> list[str]:
@@ -110,6 +125,10 @@ def otherwise(task: Task, theirs: Task) -> list[str]:
         mine, its = (np.asarray(getattr(one, name), float) for one in (task, theirs))
         if not np.allclose(mine, its):
             notes.append(f"{name} of {theirs.name} is {shown(its.tolist())}, here {shown(mine.tolist())}")
+    for its, mine in zip(_names(theirs), _names(task), strict=True):
+        nameless = any(all(re.fullmatch(NUMBERED, name) for name in names) for names in (its, mine))
+        if its != mine and not nameless:
+            notes.append(f"{theirs.name} has {', '.join(its)}, here that is {', '.join(mine)}")
     return notes
 
 

@@ -10,12 +10,14 @@ import jax.numpy as jnp
 from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import MJCF, Config
 from pegasus_jax.math import circles
+from pegasus_jax.math.units import parted
 from pegasus_jax.models.residual import Simulate
 from pegasus_jax.task import Task
 from pegasus_jax.tasks import cost_check, user_code
 from pegasus_jax.types import Array
 
 FILE = ".xml"
+UNITS = ("rad", "rad/s", "m", "m/s")  # of a file's joints; others may be those in another spelling
 
 
 def of_config(config: Config, task: Task) -> Simulate | None:
@@ -63,6 +65,13 @@ def of_file(what: str, config: Config, task: Task) -> Simulate:
             f"{what} has the state {names}, and {task.name} has {', '.join(task.state_names)};"
             " observe=[qpos.0,qvel.0] says which entries, in that order"
         )
+    for its, mine in zip(plant.state_names, task.state_names, strict=True):
+        units = {parted(name)[1] for name in (its, mine)}
+        if len(units) == 2 and units <= {*UNITS}:
+            raise ConfigError(
+                f"{what} has {its} where {task.name} has {mine}: expected the order {', '.join(task.state_names)};"
+                " observe=[qpos.0,qvel.0] says which entries, in that order"
+            )
 
     def step(x: Array, u: Array) -> Array:
         return plant.observe(plant.step(plant.state_from_observation(x), u))
