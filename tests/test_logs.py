@@ -130,6 +130,30 @@ def test_one_file_may_hold_several_episodes(column, tmp_path):
     same((x[4:], u[4:], after[4:]), SHIFTED)
 
 
+@pytest.mark.parametrize("column", ["terminals", "Timeouts", "truncated"])
+@pytest.mark.parametrize("kind", ["npz", "0", "False"])
+def test_a_row_after_an_end_begins_another_episode(column, kind, tmp_path):
+    rows, over = np.vstack([ROWS, SHIFTED]), np.arange(10) == 4
+    if kind == "npz":
+        file = tmp_path / "a.npz"
+        np.savez(file, observations=rows[:, :2], actions=rows[:, 2:], **{column: over})
+    else:
+        told = over if kind == "False" else over.astype(int)
+        file = tmp_path / "a.csv"
+        lines = [f"x,v,u,{column}", *(",".join(map(str, (*row, end))) for row, end in zip(rows, told, strict=True))]
+        file.write_text("\n".join(lines))
+    (x, u, after), notes = transitions(CART, str(file))
+    assert len(x) == 8
+    same((x[4:], u[4:], after[4:]), SHIFTED)
+    assert not [note for note in notes if column in note]
+
+
+def test_a_column_of_other_numbers_ends_no_episode(tmp_path):
+    """As one that counts, or the environment's own of that name."""
+    path = written(tmp_path / "a.csv", "x,v,u,timeouts", np.column_stack([ROWS, [0, 0, 1, 2, 2]]))
+    same(transitions(CART, path)[0])
+
+
 def test_a_long_episode_is_kept_in_parts_that_lose_no_row(tmp_path):
     rows = np.column_stack([np.linspace(0, 1, 30), np.linspace(0, 2, 30), np.linspace(-1, 1, 30)])
     found = read([written(tmp_path / "a.csv", "x,v,u", rows)], CART)[0]
@@ -245,6 +269,7 @@ GOOD = "t,x,v,u\n0,0,0,0\n.3,0,0,0\n"
         ("x,v,v\n0,0,0\n", "two columns called 'v'"),
         ("t,x,v,u\n" + "0" * 200_000, "line 2 has 200,000 letters; expected a row of numbers"),
         ("", "is empty"),
+        ("t,x,v,u\n", "has a header and no rows; expected rows of numbers"),
         ("t,x,v,u\n0,0,0,0\n", "has no episode"),
     ],
 )

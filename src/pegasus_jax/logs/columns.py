@@ -11,6 +11,8 @@ from pegasus_jax.logs import times, units
 from pegasus_jax.logs.table import EPISODE, TIMES, Names, Table, loose, plain
 
 SETTING = "data_columns"
+ENDS = {"terminal", "terminals", "terminated", "truncated", "timeout", "timeouts", "done", "dones"}
+TRUTHS = {"true": 1, "false": 0}
 
 
 class Column(NamedTuple):
@@ -31,6 +33,7 @@ class Layout(NamedTuple):
     control: tuple[Column, ...]  # [U]
     time: Column | None
     episode: str | None
+    ends: tuple[str, ...] = ()  # true in the last row of an episode
 
 
 def mapped(columns: Sequence[str], names: Names) -> dict[str, Column]:
@@ -82,11 +85,13 @@ def layout(table: Table, names: Names, columns: Sequence[str], dt: float) -> tup
     found = times.known(table.names, taken)
     time = said.get("t") or (found and Column(*found))
     episode = said[EPISODE].name if EPISODE in said else _episode(table, taken)
+    over = [name for name in table.names if loose(name) in ENDS and name not in taken]
+    ends = tuple(name for name in over if np.isfinite(truths(table, name)).all())
     called = {column: name for name, column in own.items()}
     other = [f"{c.name} is taken for {n}" for n, c in said.items() if called.get(c.name, n) != n]
     note = f"by {SETTING}=, {', and '.join(other)}" if other else ""
     if not said:
-        rest = [name for name in table.names if name not in (episode, time and time.name)]
+        rest = [name for name in table.names if name not in (episode, time and time.name, *ends)]
         if not own:
             if len(rest) != len(known):
                 raise ConfigError(
@@ -105,9 +110,8 @@ def layout(table: Table, names: Names, columns: Sequence[str], dt: float) -> tup
                 f" {SETTING}=[...] says which is which"
             )
     _same_units(table, said, names)
-    return Layout(
-        tuple(said[name] for name in names.observation), tuple(said[name] for name in names.control), time, episode
-    ), note
+    observation, control = (tuple(said[name] for name in known) for known in (names.observation, names.control))
+    return Layout(observation, control, time, episode, ends), note
 
 
 def _episode(table: Table, taken: Set[str]) -> str | None:
@@ -174,7 +178,8 @@ def word(entries: Mapping[str, Any], names: Names) -> str:
 def untimed(table: Table, where: Layout, names: Names, dt: float) -> str:
     """The note on a table without a time: which of its columns nothing uses, and what to type if one looks like it."""
     said = dict(zip((*names.observation, *names.control), (*where.observation, *where.control), strict=True))
-    unused = [name for name in table.names if name not in {where.episode, *(column.name for column in said.values())}]
+    used = {where.episode, *where.ends, *(column.name for column in said.values())}
+    unused = [name for name in table.names if name not in used]
     note = f"no column t or time: rows are taken to be dt={dt:g} s apart"
     note += f"; nothing uses {some(unused)}" if unused else ""
     if (found := times.alike(table, unused, dt)) is None:
@@ -199,6 +204,16 @@ def _alone(texts: Sequence[str], form: Callable[[str], str]) -> dict[str, str]:
     """Form -> the text that has it, of forms that one text has alone."""
     forms = [*map(form, texts)]
     return {one: text for one, text in zip(forms, texts, strict=True) if forms.count(one) == 1}
+
+
+def truths(table: Table, name: str) -> np.ndarray:
+    """1 or 0 [N] for the truths of a column, 1, 0, true or false; NaN for anything else. What is missing is 0."""
+    place = table.names.index(name)
+    found = np.nan_to_num(table.rows[:, place])
+    for (row, at), text in table.texts.items():
+        if at == place:
+            found[row] = TRUTHS.get(text.casefold(), np.nan)
+    return np.where(np.isin(found, (0, 1)), found, np.nan)
 
 
 def numbers(table: Table, column: Column) -> np.ndarray:

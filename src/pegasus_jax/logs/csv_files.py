@@ -37,6 +37,8 @@ def of_csv(path: Path) -> Table:
     above = [cell.strip() for cell in remarks[-1].lstrip("#").split(comma)] if remarks else []
     names, header = _header(cells[0], above, cells[1] if len(cells) > 1 else cells[0], comma)
     body, places = cells[header:], np.array([number for number, _ in kept][header:], int)
+    if not body:
+        raise ConfigError(f"{path} has a header and no rows; expected rows of numbers")
     if twice := [name for name in names if names.count(name) > 1]:
         raise ConfigError(f"{path} has two columns called {twice[0]!r}; expected names that differ")
     if wrong := [(line, row) for line, row in zip(places, body, strict=True) if len(row) != len(names)]:

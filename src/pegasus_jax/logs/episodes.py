@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.logs.columns import SETTING, Column, Layout, numbers, untimed
+from pegasus_jax.logs.columns import SETTING, Column, Layout, numbers, truths, untimed
 from pegasus_jax.logs.table import Table, names_of
 from pegasus_jax.logs.times import nearest
 from pegasus_jax.math.circles import to_state
@@ -35,7 +35,7 @@ class Segment(NamedTuple):
 
 
 def segments(table: Table, where: Layout, task: Task, control: str, note: Note) -> Iterator[Segment]:
-    """The episodes of a table, apart where its `episode` changes, its time goes back, or something is missing.
+    """The episodes of a table, apart where its `episode` changes, one ends, its time goes back, or rows are missing.
 
     With `control` "before" a row's controls are those sent before it, else at its time. Raises ConfigError, with the
     row, for what cannot be an episode of the task. `note` hears of everything that was decided.
@@ -56,6 +56,8 @@ def segments(table: Table, where: Layout, task: Task, control: str, note: Note) 
         )
     if where.episode is not None:
         begins |= np.diff(numbers(table, Column(where.episode))) != 0
+    for name in where.ends:
+        begins |= truths(table, name)[:-1] == 1
     episodes = np.split(np.arange(len(t)), np.flatnonzero(begins) + 1)
     alone = [rows[0] for rows in episodes if len(rows) == 1]
     if alone and len(alone) < len(episodes):  # else the file has no rows that follow each other, which is said of it
