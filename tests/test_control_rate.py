@@ -16,7 +16,7 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.policies.rate_limited import explored, follow, rate_limited
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.check import before_training
-from pegasus_jax.tasks.remembered import remembering
+from pegasus_jax.tasks.remembered import kept_by, remembering
 from pegasus_jax.types import Policy
 from probes import cart, linear_policy, tiny, unchecked
 
@@ -74,6 +74,11 @@ def test_no_control_of_an_episode_or_an_imagined_one_changes_by_more(guided):
         rolled, _ = jax.jit(exp.imagine)(state._replace(policy=state.policy._replace(params=wild)))
         assert changes(np.swapaxes(rolled.u, 0, 1)).max() <= MOST
         np.testing.assert_array_equal(rolled.x[1:, :, 2], rolled.u[:, :, 0])  # the state knows the control before
+
+
+def test_how_many_controls_are_kept_is_a_number():
+    """Of an exported policy's contract, in JSON, where a truth would be `true`."""
+    assert type(kept_by(tiny(**WORDS), cart()._replace(control_rate=np.ones(1))).controls) is int
 
 
 @pytest.mark.parametrize("exploring", [True, False])

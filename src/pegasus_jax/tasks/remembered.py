@@ -49,7 +49,7 @@ def kept_by(config: Config, task: Task) -> Kept:
     if sensors.velocity == "filter":  # a low-pass of first order
         weight = float(1 - np.exp(-2 * np.pi * (sensors.cutoff or 0.2 / task.dt) * task.dt))
     # A difference is the rate half a period ago: what has acted since then, one more control tells.
-    controls = max(sensors.delay + rows + rates, task.control_rate is not None)
+    controls = max(sensors.delay + rows + rates, int(task.control_rate is not None))
     return Kept(controls, rows, rates, weight)
 
 
