@@ -23,7 +23,7 @@ import benchmarks
 from benchmarks import RESULTS, pictures, readme_table, results_page, searches, study
 from benchmarks.paper import comparison, figures
 from benchmarks.plants_suite import batched
-from benchmarks.robot import costs
+from benchmarks.robot import costs, prior_cost
 from benchmarks.speed import compare, scaling, timing
 from benchmarks.speed.workloads import SIZES, flop, products, workload
 from folders import a_run
@@ -251,11 +251,26 @@ def test_a_benchmark_that_is_asked_what_it_does_says_so_and_does_nothing(module,
 
 
 @pytest.mark.parametrize(
-    ("main", "words"), [(study.main, []), (study.main, ["seeds=0-3"]), (costs.main, []), (batched.main, ["reacher"])]
+    ("main", "words"),
+    [
+        (study.main, []),
+        (study.main, ["seeds=0-3"]),
+        (costs.main, []),
+        (batched.main, ["reacher"]),
+        (scaling.main, []),
+        (scaling.main, ["counts=10"]),
+    ],
 )
 def test_a_benchmark_without_its_first_word_says_what_that_is(main, words):
     with pytest.raises(ConfigError, match="the first word is missing; expected "):
         main(words)
+
+
+def test_a_benchmark_refuses_a_word_that_it_does_not_know():
+    with pytest.raises(ConfigError, match=r"seds is unknown; did you mean 'seeds'"):
+        scaling.main(["seds"])
+    with pytest.raises(ConfigError, match=r"foo is one word too many; expected none"):
+        prior_cost.main(["foo"])
 
 
 # Stored results

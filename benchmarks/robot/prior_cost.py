@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from benchmarks import command
 from pegasus_jax import preset, tasks
 from pegasus_jax.assembly.pieces import dynamics_of
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.models.residual import residual
 from pegasus_jax.types import Dataset
 from pegasus_jax.vectorized import for_particles
@@ -70,8 +71,10 @@ def seconds(prior: Any, file: Path) -> tuple[float, float]:
     return compiled, (time.monotonic() - began) / 3
 
 
-def main(_: Sequence[str] = ()) -> None:
-    """Print the table."""
+def main(words: Sequence[str] = ()) -> None:
+    """Print the table. Raises ConfigError for any word."""
+    if words:
+        raise ConfigError(f"{words[0]} is one word too many; expected none")
     with tempfile.TemporaryDirectory() as folder:
         files = {name: Path(folder) / f"{name}.xml" for name in ("free", "limited")}
         files["free"].write_text(LINK.format(limits=""))

@@ -26,11 +26,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from benchmarks import RESULTS, command
+from benchmarks import RESULTS, command, named
 from benchmarks.speed.timing import summary
 from benchmarks.speed.workloads import ALIKE, workload
 from pegasus_jax import sharding
 from pegasus_jax.assembly.experiments import compose
+from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io, writers
 from pegasus_jax.runs.job import first_states, opened
@@ -154,7 +155,9 @@ PARTS = {"seeds": of_seeds, "devices": of_devices, "particles": of_particles}
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    part, *rest = words
+    part, rest = named(words, f"one of {', '.join(PARTS)}")
+    if part not in PARTS:
+        raise ConfigError(f"{part} is unknown; {did_you_mean(part, PARTS)}")
     options, dotted = config_io.split(rest, ("counts", "devices", "seeds", "steps", "repeats", "out"))
     path = Path(options.get("out", RESULTS)) / f"scaling-{part}.json"
     path.parent.mkdir(parents=True, exist_ok=True)
