@@ -98,7 +98,7 @@ def beyond(x: Any) -> Any:
     [
         (["seed=0,0"], "give each value once"),
         (["seed=0,"], "empty value"),
-        (["seed=4-2"], "seed=0-2"),
+        (["seed=4-2"], "4-2 counts down; type 2-4"),
         (["seed=0-99999999"], "0-99999999 is a range of more than 10,000 numbers"),
         (["seed=0-999", "trials=1-999"], "999,000 combinations; a sweep has at most 10,000"),
         (["seeds=99999999999999999999"], "the nearest is 10000"),

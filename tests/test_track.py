@@ -158,6 +158,8 @@ def test_the_words_of_trackers(monkeypatch: pytest.MonkeyPatch) -> None:
         assert understood(["task=cartpole", f"track={text}"])[0].track == names
     with pytest.raises(ConfigError, match=r"track=wandbb is unknown; did you mean 'wandb'"):
         understood(["task=cartpole", "track=wandbb"])
+    with pytest.raises(ConfigError, match=r"track=none,wandb has none beside others; type track=none, or leave it out"):
+        understood(["task=cartpole", "track=none,wandb"])
     monkeypatch.setattr(trackers, "find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"track=mlflow needs .*'pegasus-jax\[track\]'"):
         understood(["task=cartpole", "track=mlflow"])

@@ -265,7 +265,9 @@ def test_a_policy_that_sees_something_else_is_no_beginning(tmp_path):
     limited = a_run(tmp_path / "limited", control_rate="50", **NETWORK)
     words = dict(cost=lambda x, goal: x[0] ** 2 + goal[0], goal_low="[-1]", goal_high="[1]", **NETWORK)
     with pytest.raises(
-        ConfigError, match=r"sees .*force \[N\] 1 before, and here .*goal 0; that run has control_rate=\[50\]"
+        ConfigError,
+        match=r"sees .*force \[N\] 1 before, and here .*goal 0; that run has control_rate=\[50\]"
+        r" and goal_low=\[\] and goal_high=\[\]: say",
     ):
         check.report(parse(init=str(limited), **words))
     for given in (

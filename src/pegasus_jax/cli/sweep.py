@@ -75,6 +75,8 @@ def values(text: str) -> list[str]:
             parts[-1] += letter
     ranges = [re.fullmatch(r"(\d+)-(\d+)", part) for part in parts]
     for part, found in zip(parts, ranges, strict=True):
+        if found and int(found[1]) > int(found[2]):
+            raise ConfigError(f"{part} counts down; type {found[2]}-{found[1]}")
         if found and int(found[2]) - int(found[1]) >= MOST:
             raise ConfigError(f"{part} is a range of more than {MOST:,} numbers; give fewer, for example 0-9")
     return [

@@ -135,9 +135,9 @@ def otherwise(task: Task, theirs: Task) -> list[str]:
 def remembered(old: Config, config: Config) -> str:
     """The end of a line that two policies see different things: the words that make it so, or "" where none do."""
     its, mine = (config_io.leaves(one.sensors, "sensors.") for one in (old, config))
-    for name in ("history", "control_rate", "goal_low"):
+    for name in ("history", "control_rate", "goal_low", "goal_high", "goals", "reference"):
         its, mine = its | {name: getattr(old, name)}, mine | {name: getattr(config, name)}
-    words = [f"{name}={shown(its[name])}" for name in its if its[name] != mine[name]]
+    words = [f"{name}={shown(its[name])}" for name in its if shown(its[name]) != shown(mine[name])]
     return f"; that run has {' and '.join(words)}: say the same in both" if words else ""
 
 

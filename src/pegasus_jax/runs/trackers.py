@@ -120,6 +120,8 @@ def asked(track: str | Sequence[str] | None) -> tuple[str, ...] | None:
     names = [name.strip() for name in text.split(",")]
     if names == [NONE]:
         return ()
+    if NONE in names:
+        raise ConfigError(f"track={text} has none beside others; type track=none, or leave it out")
     for name in names:
         if name not in TRACKERS:
             raise ConfigError(f"track={name} is unknown; {did_you_mean(name, (*TRACKERS, NONE))}")
