@@ -184,14 +184,16 @@ def test_a_question_that_makes_no_sense_stops_the_motors(
     robot.close()
 
 
-def test_what_is_no_message_ends_the_connection(sides: Any, served: Served) -> None:
+@pytest.mark.parametrize("line", [b"[1, 2]\n", b"[" * 60_000 + b"\n"])
+def test_what_is_no_message_ends_the_connection(sides: Any, served: Served, line: bytes) -> None:
     robot = driver(sides, served)
     robot.reset()
     robot.step(np.array([1.0, 1.0]))
-    robot._robot._socket.sendall(b"[1, 2]\n")
+    robot._robot._socket.sendall(line)
     assert served.stopped(within=0.4)
     with pytest.raises(ConnectionError, match="was lost at control 2, the other side closed the connection"):
         robot.step(np.array([1.0, 1.0]))
+    driver(sides, served).close()  # the next one is answered
 
 
 def test_a_robot_that_does_not_answer_in_time_is_let_go(sides: Any, served: Served) -> None:

@@ -23,11 +23,7 @@ import time
 PROTOCOL = 1
 LONGEST = 2**16  # bytes of a line
 # A driver whose computer is off says nothing more: without these it would keep the robot's side for itself.
-ALIVE = {
-    "TCP_KEEPIDLE": 5,
-    "TCP_KEEPINTVL": 2,
-    "TCP_KEEPCNT": 5,
-}  # seconds, seconds, times; as far as a system has them
+ALIVE = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 5}  # s, s, times; as far as a system has them
 
 
 class Connection:
@@ -58,7 +54,10 @@ class Connection:
             if len(self._rest) > LONGEST:
                 raise ValueError("a message is longer than 64 KiB")
         line, _, self._rest = self._rest.partition(b"\n")
-        message = json.loads(line)
+        try:
+            message = json.loads(line)
+        except RecursionError as error:
+            raise ValueError("a message is nested too deeply") from error
         if not isinstance(message, dict):
             raise ValueError(f"a message is a JSON object, not {message!r}")
         return message
