@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import re
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -145,18 +146,26 @@ def test_what_it_cannot_use_stops_it_until_it_is_enabled_again(ros: Any, spoil: 
     assert tick(node) != [0.25]
 
 
-def test_it_ends_at_rest(ros: Any) -> None:
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
+def test_it_ends_at_rest(ros: Any, name: str) -> None:
+    """Published before the signal ends the connections."""
     nodes: list[Any] = []
+    before = {sent: signal.getsignal(sent) for sent in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
     def spun(node: Any) -> None:
         nodes.append(node)
         read(ros, node, [0.0] * 4)
         enable(ros, node)
         tick(node)
-        raise KeyboardInterrupt
+        signal.raise_signal(getattr(signal, name))
 
     sys.modules["rclpy"].on_spin.append(spun)  # type: ignore[attr-defined]
-    ros.main()
+    try:
+        ros.main()
+    finally:
+        for sent, handler in before.items():
+            signal.signal(sent, handler)
     first, last = (message.data for message in nodes[0].publishers["commands"].sent)
     assert first != [0.0]
     assert last == [0.0]

@@ -11,12 +11,14 @@ what is no number. It begins disabled, says its contract, and then only publishe
 
 import re
 import runpy
+import signal
 import time
 from typing import Any
 
 import numpy as np
 import rclpy
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import SetBool
@@ -129,7 +131,10 @@ class PolicyNode(Node):
 
 
 def main() -> None:
-    rclpy.init()
+    # ROS's own handlers would end the connections first, so that rest could not be published.
+    rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+    for name in {"SIGTERM", "SIGHUP"} & {*dir(signal)}:
+        signal.signal(getattr(signal, name), signal.default_int_handler)
     node = PolicyNode()
     try:
         rclpy.spin(node)

@@ -2,17 +2,30 @@
 
 from collections.abc import Callable
 
+from rclpy import node
 from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
 
 on_spin: list[Callable[[Node], None]] = []  # what happens while a node spins
 
 
-def init(*, args: list[str] | None = None) -> None: ...
+handled = SignalHandlerOptions.ALL
 
 
-def spin(node: Node) -> None:
-    for happens in on_spin:
-        happens(node)
+def init(
+    *, args: list[str] | None = None, signal_handler_options: SignalHandlerOptions = SignalHandlerOptions.ALL
+) -> None:
+    global handled
+    handled, node.context_is_valid = signal_handler_options, True
+
+
+def spin(spun: Node) -> None:
+    try:
+        for happens in on_spin:
+            happens(spun)
+    except KeyboardInterrupt:
+        node.context_is_valid = handled == SignalHandlerOptions.NO  # as since ROS 2 Humble
+        raise
 
 
 def try_shutdown() -> None: ...

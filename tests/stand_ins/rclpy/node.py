@@ -7,6 +7,7 @@ Message = TypeVar("Message")
 Service = TypeVar("Service")
 
 parameters: dict[str, Any] = {}  # as --ros-args -p gives them
+context_is_valid = True  # until it is shut down
 
 
 class Parameter:
@@ -19,6 +20,8 @@ class Publisher(Generic[Message]):
         self.sent: list[Message] = []
 
     def publish(self, msg: Message) -> None:
+        if not context_is_valid:
+            raise RuntimeError("Failed to publish: publisher's context is invalid")  # RCLError in rclpy
         self.sent.append(msg)
 
 
