@@ -22,6 +22,7 @@ import pytest
 import pegasus_jax as pg
 from folders import a_run
 from pegasus_jax.config import Explore, Sensors
+from pegasus_jax.imagine.limits import Constraint
 from pegasus_jax.task import Signal
 from probes import unchecked
 
@@ -662,6 +663,28 @@ WRONG_TASKS = [
         dict(control_low=[2.0], control_high=[-2.0]),
         r"the task's limits of force are 2 and -2; expected control_low first",
     ),
+    (dict(control_rate=2.0), r"the task's control_rate has shape \(\); expected \(1,\), of 1 controls"),
+    (dict(control_rate=[-1.0]), r"the task's control_rate is \[-1\.0\]; expected numbers above 0, or None"),
+    (dict(control_rate=[np.nan]), r"the task's control_rate is \[nan\]; expected finite numbers"),
+    (dict(rates=(7,)), r"the task's rates=\(7,\) has 7; its 2 states are 0 to 1"),
+    (dict(rates=(1, 1)), r"the task's rates=\[1,1\] names 1 twice"),
+    (dict(angles=0), r"the task's angles=0 is no tuple of places in the state; for example \(0,\)"),
+    (dict(starts=[1.0, 0.0]), r"the task's starts has shape \(2,\); expected \(N, 2\), rows of 2 states"),
+    (dict(starts=[[1.0]]), r"the task's starts has shape \(1, 1\); expected \(N, 2\)"),
+    (dict(starts_std=[1.0]), r"the task's starts_std has shape \(1,\); expected \(2,\)"),
+    (dict(success="low"), r"the task's success=low is no number"),
+    (dict(constraint=lambda x: x[0]), r"the task's constraint is of type function; expected .*Constraint\(of_state, "),
+    (
+        dict(constraint=Constraint(lambda x: jnp.zeros((2, 2)))),
+        r"the task's constraint has values of shape \(2, 2\); expected one number, or a vector",
+    ),
+    (dict(stop=lambda x: x > 1), r"the task's stop has values of shape \(2,\); expected \(\), the probability"),
+    (dict(stop=lambda x: x[0] - 2), r"the task's stop is -2 at start_mean; expected a probability, from 0 to 1"),
+    (dict(prior=lambda x, u: x[:1]), r"the task's prior has values of shape \(1,\); expected \(2,\), the state one"),
+    (dict(prior=lambda x: x), r"prior=.*TypeError: .*\(test_api\.py:\d+\)"),
+    (dict(goal=Signal(lambda key: [0.0], (1.0,))), r"the task's goal has values of type list; expected an array"),
+    (dict(goal=Signal(jax.random.normal, 1.0)), r"the task's goal has units=1\.0; expected a tuple of numbers"),  # type: ignore[arg-type]
+    (dict(goal=Signal(lambda key: jnp.zeros(1), (0.0,))), r"the task's goal has units=\(0\.0,\); .* above 0"),
 ]
 
 
@@ -669,6 +692,12 @@ WRONG_TASKS = [
 def test_a_task_whose_fields_do_not_agree_is_refused_in_one_line(fields: dict[str, Any], message: str) -> None:
     with pytest.raises(pg.ConfigError, match=f"^{message}"):
         pg.compose(CONFIG, TASK._replace(**fields))
+
+
+def test_places_in_the_state_may_be_any_whole_numbers_in_a_row() -> None:
+    task = pg.compose(CONFIG, TASK._replace(angles=np.array([0]), rates=[np.int64(1)], horizon=np.int64(H))).task  # type: ignore[arg-type]
+    assert (task.angles, task.rates, task.horizon) == ((0,), (1,), H)
+    assert type(task.horizon) is int
 
 
 UNTRACEABLE = [

@@ -89,6 +89,7 @@ def test_an_environment_not_written_for_us(env: str, cost: str, states: int, lim
 def task_of(env: str, states: int, horizon: int = 9, low: float = -2.0, high: float = 2.0) -> Task:
     """A task on a registered environment of one control, whose cost is that of its first observation."""
     return cart(horizon)._replace(
+        rates=(),
         name=env,
         plant=None,
         environment=env_plant(env, (), states, 1),

@@ -1,10 +1,9 @@
 """What is to be learned: a plant, a cost, where episodes start, and what is asked of a policy from outside."""
 
 from collections.abc import Callable
+from operator import index
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -85,42 +84,57 @@ def known(task: Task, field: str) -> np.ndarray:
 
 
 def checked(task: Task) -> Task:
-    """The task itself. Raises ConfigError, in one line, where its fields do not agree.
+    """The task, with its places in the state as tuples. Raises ConfigError, in one line, where fields do not agree.
 
-    A mistake in one that somebody wrote would come back as a shape from deep inside JAX, or not at all.
+    A mistake in one that somebody wrote would come back as a shape from deep inside JAX, or not at all. What its
+    functions answer, `assembly.own_pieces.try_task` looks at.
     """
     states, controls = len(task.state_names), len(task.control_names)
-    sizes = {"start_mean": states, "start_std": states, "sensor_std": states}
-    for name, size in (sizes | {"control_low": controls, "control_high": controls}).items():
-        if np.shape(getattr(task, name)) != (size,):
-            of = f"{size} {'states' if name in sizes else 'controls'}"
-            raise ConfigError(
-                f"the task's {name} has shape {np.shape(getattr(task, name))}; expected ({size},), of {of}"
-            )
+    sizes = {"start_mean": states, "start_std": states, "sensor_std": states, "starts_std": states}
+    for name, size in (sizes | dict.fromkeys(("control_low", "control_high", "control_rate"), controls)).items():
         given: Any = getattr(task, name)
-        if not isinstance(given, Tracer) and not np.isfinite(np.asarray(given, float)).all():
-            raise ConfigError(f"the task's {name} is {given}; expected finite numbers")
+        if (shape := np.shape(given)) == (size,):
+            _finite(name, given)
+        elif given is not None or name not in ("starts_std", "control_rate"):
+            of = f"{size} {'states' if name in sizes else 'controls'}"
+            raise ConfigError(f"the task's {name} has shape {shape}; expected ({size},), of {of}")
+    starts: Any = task.starts
+    if starts is not None:
+        if (shape := np.shape(starts)) != (*shape[:1], states) or not shape[0]:
+            raise ConfigError(f"the task's starts has shape {shape}; expected (N, {states}), rows of {states} states")
+        _finite("starts", starts)
+    rate: Any = task.control_rate
+    if rate is not None and not isinstance(rate, Tracer) and not (np.asarray(rate) > 0).all():
+        raise ConfigError(f"the task's control_rate is {rate}; expected numbers above 0, or None for any rate")
     if not isinstance(task.horizon, int | np.integer) or task.horizon < 1:
         raise ConfigError(f"the task's horizon={task.horizon!r} is not a whole number of control periods, at least 1")
     dt: Any = task.dt
     if not isinstance(dt, Tracer) and not (isinstance(dt, float | int | np.number | np.ndarray) and 0 < dt < np.inf):
         raise ConfigError(f"the task's dt={shown(dt)} is no control period; expected a number of seconds above 0")
-    if wrong := [angle for angle in task.angles if angle not in range(states)]:
-        raise ConfigError(f"the task's angles={task.angles} has {wrong[0]}; its {states} states are 0 to {states - 1}")
-    different("the task's angles", task.angles)
-    for name in ("goal", "reference"):
-        if not isinstance(given := getattr(task, name), Signal | None):
-            raise ConfigError(f"the task's {name} is of type {type(given).__name__}; expected Signal(value, units)")
-        if given is not None and (shape := _shape_of(name, given)) != (size := (len(given.units),)):
-            raise ConfigError(f"the task's {name} has values of shape {shape}; expected {size}, as many as its units")
+    success: Any = task.success
+    if not isinstance(success, float | int | np.number | np.ndarray | Array) or np.ndim(success):
+        raise ConfigError(f"the task's success={shown(success)} is no number; expected a cost a step, as 0.2")
     if not any(isinstance(limit, Tracer) for limit in (task.control_low, task.control_high)):
         for name, low, high in zip(task.control_names, task.control_low, task.control_high, strict=True):
             if not low < high:
                 raise ConfigError(f"the task's limits of {name} are {low:g} and {high:g}; expected control_low first")
-    return task
+    places = {name: _places(name, getattr(task, name), states) for name in ("angles", "rates")}
+    return task._replace(**places, horizon=int(task.horizon))
 
 
-def _shape_of(name: str, signal: Signal) -> tuple[int, ...]:
-    """The shape of the values of a reference, a function of time, or of a goal, of a key."""
-    given = jnp.zeros(()) if name == "reference" else jax.random.key(0)
-    return jax.eval_shape(lambda x: jnp.asarray(signal.value(x)), given).shape
+def _finite(name: str, given: Any) -> None:
+    """Raises ConfigError for a field with an entry that is not finite, unless JAX traces it."""
+    if not isinstance(given, Tracer) and not np.isfinite(np.asarray(given, float)).all():
+        raise ConfigError(f"the task's {name} is {given}; expected finite numbers")
+
+
+def _places(name: str, given: Any, states: int) -> tuple[int, ...]:
+    """The entries of the state that a field names. Raises ConfigError for what are none, and for one named twice."""
+    try:
+        places = tuple(map(index, given))
+    except TypeError:
+        raise ConfigError(f"the task's {name}={given!r} is no tuple of places in the state; for example (0,)") from None
+    if wrong := [place for place in places if place not in range(states)]:
+        raise ConfigError(f"the task's {name}={places} has {wrong[0]}; its {states} states are 0 to {states - 1}")
+    different(f"the task's {name}", places)
+    return places

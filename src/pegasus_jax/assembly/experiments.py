@@ -11,7 +11,7 @@ from jax.sharding import Mesh
 from pegasus_jax import config as settings
 from pegasus_jax import episode, tasks
 from pegasus_jax.assembly.agreement import agree
-from pegasus_jax.assembly.own_pieces import try_dynamics, try_policy
+from pegasus_jax.assembly.own_pieces import try_dynamics, try_policy, try_task
 from pegasus_jax.assembly.pieces import drawing_rates, dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import fresh_policies, limits, refines_successes, search_of
 from pegasus_jax.checks import ConfigError
@@ -98,7 +98,9 @@ def assembled(config: settings.Config, task: Task, mesh: Mesh | None, logged: in
     """`compose` with a task that may know less than its config, as that of a run's folder does."""
     names = ("dynamics", "policy", "fitter", "searcher", "cost")
     dynamics, policy, fitter, searcher, cost = (pieces.get(name) for name in names)
-    task = remembering(config, checked(task._replace(cost=as_cost(task.cost))))
+    task = checked(task._replace(cost=as_cost(task.cost)))
+    try_task(task)
+    task = remembering(config, task)
     task = tasks.whole(task, None if cost is None else as_cost(cost))
     if dynamics is not None:
         try_dynamics(dynamics, task, capacity(config, task, logged), fits=fitter is None)

@@ -1,21 +1,75 @@
-"""A model and a policy that a caller made, tried on shapes alone before anything is composed of them.
+"""A task, a model and a policy that a caller made, tried on shapes alone before anything is composed of them.
 
 What is wrong with one is then a line that names its function, and not a message from inside a fit or a search.
 """
 
+from contextlib import suppress
 from functools import partial
+from inspect import unwrap
+from numbers import Real
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 
-from pegasus_jax.checks import ConfigError
+from pegasus_jax.checks import ConfigError, RunError, shown
+from pegasus_jax.imagine.limits import Constraint
 from pegasus_jax.learn.data import empty
 from pegasus_jax.memory import given_size, seen_names
 from pegasus_jax.shapes import check_floating, check_prediction, check_shape
-from pegasus_jax.task import Task
+from pegasus_jax.task import Signal, Task
 from pegasus_jax.tasks.user_code import blamed
 from pegasus_jax.types import Batch, Dynamics, Key, Policy
+
+
+def try_task(task: Task) -> None:
+    """Raises ConfigError, in one line, for a function of a task that does not answer as `Task` says.
+
+    A task that is whole already has functions of x' [D + M].
+    """
+    more = 0 if task.terms is None else len(task.memory.names)
+    states, arrays = len(task.state_names), jnp.zeros(()).dtype
+    x, whole, u = (jax.ShapeDtypeStruct((n,), arrays) for n in (states, states + more, len(task.control_names)))
+    for name, given in (("goal", jax.random.key(0)), ("reference", jnp.zeros(()))):
+        if not isinstance(signal := getattr(task, name), Signal | None):
+            raise ConfigError(f"the task's {name} is of type {type(signal).__name__}; expected Signal(value, units)")
+        if signal is None:
+            continue
+        if not isinstance(signal.units, tuple | list) or not all(
+            isinstance(n, Real) and 0 < n < np.inf for n in signal.units
+        ):
+            raise ConfigError(f"the task's {name} has units={signal.units!r}; expected a tuple of numbers above 0")
+        size = (len(signal.units),)
+        _answers(name, signal.value, size, f"{size}, as many as its units", given)
+    if not isinstance(limits := task.constraint, Constraint | None):
+        raise ConfigError(
+            f"the task's constraint is of type {type(limits).__name__};"
+            " expected pegasus_jax.imagine.limits.Constraint(of_state, bound)"
+        )
+    if limits is not None:
+        _answers("constraint", limits.of_state, None, "one number, or a vector", whole)
+    if task.prior is not None:
+        _answers("prior", task.prior, (states,), f"({states},), the state one period later", x, u)
+    if task.stop is not None:
+        _answers("stop", task.stop, (), "(), the probability that an episode ends there", whole)
+        value: Any = 0.0 if more else task.stop(jnp.asarray(task.start_mean, float))
+        if not isinstance(value, Tracer) and not 0 <= value <= 1:
+            raise ConfigError(f"the task's stop is {value:g} at start_mean; expected a probability, from 0 to 1")
+
+
+def _answers(name: str, function: Any, shape: tuple[int, ...] | None, expected: str, *given: Any) -> None:
+    """Raises ConfigError unless a task's function returns an array of this shape; None: of one number, or a vector.
+
+    A RunError is of a task that is read back from a run's folder: nobody imported its functions, which say so.
+    """
+    with blamed(f"{name}={shown(unwrap(function))}", function), suppress(RunError):
+        found = jax.eval_shape(function, *given)
+        if not isinstance(found, jax.ShapeDtypeStruct):
+            raise ConfigError(f"the task's {name} has values of type {type(found).__name__}; expected an array")
+        if len(found.shape) > 1 if shape is None else found.shape != shape:
+            raise ConfigError(f"the task's {name} has values of shape {found.shape}; expected {expected}")
 
 
 def try_dynamics(dynamics: Dynamics, task: Task, rows: int, fits: bool) -> None:
