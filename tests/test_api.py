@@ -540,6 +540,14 @@ def test_an_episode_names_what_is_wrong_with_it() -> None:
         experiment.add_episode(state, good._replace(x=jnp.zeros((H + 1, D), int)))
 
 
+def test_one_answer_is_not_that_of_two_controls() -> None:
+    limits = dict(control_low=np.full(2, -1.0), control_high=np.ones(2), control_names=("a", "b"))
+    for answer, shape in ((jnp.zeros(()), r"\(\)"), (jnp.zeros(1), r"\(1,\)")):
+        policy = pg.of_pair(lambda key: (), lambda params, features, u=answer: u, TASK._replace(**limits))
+        with pytest.raises(ValueError, match=rf"what apply returns has shape {shape}; expected \[U\] \(2,\)"):
+            policy.apply((), (), X)
+
+
 def wrong_model(**functions: Any) -> dict[str, Any]:
     return dict(dynamics=DYNAMICS._replace(**functions))
 
