@@ -36,9 +36,22 @@ def test_an_angle_that_is_no_dimension_is_refused(place):
         lambda: encode(x, (place,)),
         lambda: difference(x, x, (place,)),
         lambda: sincos(x, jnp.eye(4), (place,)),
+        lambda: feature_names(("a", "b", "c", "d"), (place,)),
     ):
         with pytest.raises(ValueError, match=rf"angles=\({place},\) has {place}; expected indices from 0 to 3"):
             made()
+
+
+def test_an_angle_that_is_named_twice_is_refused():
+    for made in (lambda: encode(jnp.zeros(4), (3, 3)), lambda: feature_names(("a", "b", "c", "d"), (3, 3))):
+        with pytest.raises(ValueError, match=r"angles=\(3, 3\) has 3 twice; expected different indices"):
+            made()
+
+
+def test_differences_of_arrays_of_numpy_are_wrapped():
+    np.testing.assert_allclose(
+        difference(np.array([3.0, 3.0]), np.array([-3.0, -3.0]), (0,)), [6 - 2 * PI, 6], rtol=1e-6
+    )
 
 
 @given(angle)

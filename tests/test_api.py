@@ -538,6 +538,14 @@ def test_an_episode_names_what_is_wrong_with_it() -> None:
         experiment.add_episode(state, good._replace(u=jnp.zeros((H, 2))))
     with pytest.raises(ValueError, match=r"an episode's x is of int32"):
         experiment.add_episode(state, good._replace(x=jnp.zeros((H + 1, D), int)))
+    with pytest.raises(ValueError, match=r"an episode's x has shape \(5, 1\); expected \(5, 2\)"):
+        experiment.calibrate(state, good._replace(x=jnp.zeros((H + 1, 1))))
+
+
+def test_an_episode_may_be_of_numpy() -> None:
+    task = TASK._replace(angles=(0,), rates=())
+    experiment, one = pg.compose(CONFIG, task), jax.device_get(trajectory())
+    jax.eval_shape(lambda state: experiment.calibrate(state, one), experiment.init(key()))
 
 
 def test_one_answer_is_not_that_of_two_controls() -> None:

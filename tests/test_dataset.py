@@ -58,6 +58,25 @@ def test_grown_data_is_the_same_data_with_more_room():
     assert all(np.array_equal(a, b) for a, b in zip(again, filled(3, 5 * H), strict=True))
 
 
+@pytest.mark.parametrize(("x", "u"), [(1, U), (D, 1)])
+def test_an_episode_of_another_width_is_refused(x, u):
+    """It would fill every column with one."""
+    narrow = episode(0)._replace(x=jnp.zeros((H + 1, x)), u=jnp.zeros((H, u)))
+    with pytest.raises(ValueError, match=r"an episode's \w has shape \(\d, 1\); expected \(\d, \d\)"):
+        dataset.add(dataset.empty(H, D, U), narrow, ())
+
+
+def test_numbers_of_numpy_are_numbers():
+    assert dataset.room(np.int64(10)) == dataset.room(10)
+    data, one = dataset.empty(H, D, U), jax.device_get(episode(0))
+    assert np.array_equal(dataset.add(data, one, (1,)).y, filled(1, H).y)
+    fetched = jax.device_get(filled(1, H))
+    batches = [
+        jax.jit(lambda key, of=of: dataset.minibatch(key, of, 4))(jax.random.key(0)) for of in (fetched, filled(1, H))
+    ]
+    assert np.array_equal(batches[0].x, batches[1].x)
+
+
 @given(st.integers(0, 2**16), st.integers(1, 3))
 def test_a_minibatch_holds_whole_rows_in_use(seed, episodes):
     data = filled(episodes, 3 * H)

@@ -20,7 +20,7 @@ from pegasus_jax.learn.successor import after_episode, came_back
 from pegasus_jax.models.calibration import calibration
 from pegasus_jax.policies.driver import driver
 from pegasus_jax.policies.rate_limited import before, explored, with_state
-from pegasus_jax.shapes import check_shape
+from pegasus_jax.shapes import check_trajectory
 from pegasus_jax.task import Task
 from pegasus_jax.types import (
     Array,
@@ -178,9 +178,7 @@ def experiment(
         Raises ValueError for arrays of other shapes, and, outside of jit, for numbers that are not finite and where
         there is no room left.
         """
-        trajectory = trajectory._replace(
-            **{name: jnp.asarray(getattr(trajectory, name)) for name in ("x", "u", "cost")}
-        )
+        trajectory = as_arrays(trajectory)
         check_episode(state, trajectory, controls)
         ran, m = as_modeled(trajectory)
         data = dataset.add(state.data, ran, task.angles, m)
@@ -296,8 +294,10 @@ def experiment(
     def calibrate(state: RunState, trajectory: Trajectory) -> Array:
         """`calibration` of the model as it is, on the next episode before it is added; NaN before the first fit.
 
-        With a key of its own, so that asking changes nothing.
+        With a key of its own, so that asking changes nothing. Raises ValueError for arrays of other shapes.
         """
+        trajectory = as_arrays(trajectory)
+        check_trajectory(trajectory, states, controls)
         posterior = posterior_of(state)
         key = trial_key(state.key, state.trial + 1, CALIBRATE)
         ran, _ = as_modeled(trajectory)
@@ -322,12 +322,15 @@ def experiment(
     )
 
 
+def as_arrays(trajectory: Trajectory) -> Trajectory:
+    """The episode, whose numbers may be NumPy's, in arrays of JAX."""
+    return trajectory._replace(**{name: jnp.asarray(getattr(trajectory, name)) for name in ("x", "u", "cost")})
+
+
 def check_episode(state: RunState, trajectory: Trajectory, controls: int) -> None:
     """Raise ValueError for an episode that is not one of the task's, as far as can be told."""
-    states, horizon = state.data.x.shape[1], len(trajectory.u)
-    shapes = dict(x=(horizon + 1, states), u=(horizon, controls), cost=(horizon,))
-    for name, shape in shapes.items():
-        check_shape(f"an episode's {name}", getattr(trajectory, name), shape)
+    horizon = len(trajectory.u)
+    check_trajectory(trajectory, state.data.x.shape[1], controls)
     if any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves((state.data.size, trajectory))):
         return
     told: Any = horizon if trajectory.length is None else trajectory.length

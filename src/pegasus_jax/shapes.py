@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from pegasus_jax.types import Dataset, Params, Prediction, Scenarios, TrainState
+from pegasus_jax.types import Dataset, Params, Prediction, Scenarios, TrainState, Trajectory
 
 Shape = tuple[int | None, ...]  # None: any size
 ARRAYS = (jax.Array, np.ndarray, np.generic, jax.ShapeDtypeStruct, float, int)
@@ -83,6 +83,13 @@ def check_data(data: Dataset) -> None:
     check_shape("data.x", data.x, (None, None), "[N, D]")
     check_shape("data.u", data.u, (len(data.x), None), "[N, U]")
     check_shape("data.y", data.y, data.x.shape, "[N, D]")
+
+
+def check_trajectory(trajectory: Trajectory, states: int, controls: int) -> None:
+    """Raises ValueError unless an episode has x [H+1, D], u [H, U] and cost [H], in floating-point numbers."""
+    horizon = len(trajectory.u)
+    for name, shape in dict(x=(horizon + 1, states), u=(horizon, controls), cost=(horizon,)).items():
+        check_shape(f"an episode's {name}", getattr(trajectory, name), shape)
 
 
 def _written(shape: Shape) -> str:

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from pegasus_jax.math.angles import difference
+from pegasus_jax.shapes import check_trajectory
 from pegasus_jax.types import Array, Batch, Dataset, Key, Trajectory
 
 __all__ = ["add", "empty", "grow", "minibatch", "room"]
@@ -13,7 +14,7 @@ LEAST_ROOM = 1024  # rows; 40 episodes of the cart-pole
 
 def room(rows: int) -> int:
     """The capacity for at least so many rows: a power of two, so that runs of other lengths share compiled programs."""
-    return max(LEAST_ROOM, 1 << (rows - 1).bit_length())
+    return max(LEAST_ROOM, 1 << (int(rows) - 1).bit_length())
 
 
 def empty(capacity: int, states: int, controls: int, memory: int = 0) -> Dataset:
@@ -25,13 +26,13 @@ def empty(capacity: int, states: int, controls: int, memory: int = 0) -> Dataset
 def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...], memory: Array | None = None) -> Dataset:
     """The data set with the transitions of an episode behind it (Alg. 1 line 4), and what was remembered [H+1, M].
 
-    Of an episode that ended early only the rows that took place. Rows for which there is no room are left out, and what
-    is there stays: the caller sizes a data set for the whole run (trials x horizon).
+    Only its rows that took place and for which there is room, behind what stays: the caller sizes a data set for the
+    whole run (trials x horizon). Raises ValueError for an episode of other widths.
     """
+    check_trajectory(trajectory, data.x.shape[1], data.u.shape[1])
     horizon, capacity = trajectory.u.shape[0], data.x.shape[0]
     length = horizon if trajectory.length is None else jnp.clip(trajectory.length, 0, horizon)
-    rows = jnp.arange(horizon)
-    place = jnp.where(rows < length, data.size + rows, capacity)  # beyond the end: dropped
+    place = jnp.where((rows := jnp.arange(horizon)) < length, data.size + rows, capacity)  # beyond the end: dropped
     y = difference(trajectory.x[1:], trajectory.x[:-1], angles)
     new = Dataset(trajectory.x[:-1], trajectory.u, y, data.size, None if memory is None else memory[:-1])
     placed = jax.tree.map(lambda old, rows: old if old.ndim == 0 else old.at[place].set(rows, mode="drop"), data, new)
@@ -40,11 +41,10 @@ def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...], memory: 
 
 def grow(data: Dataset, capacity: int) -> Dataset:
     """The same data with room for `capacity` rows, at least as many as now."""
-    more = capacity - data.x.shape[0]
-    return jax.tree.map(lambda rows: jnp.pad(rows, ((0, more), (0, 0))) if rows.ndim else rows, data)
+    return jax.tree.map(lambda rows: jnp.pad(rows, ((0, capacity - len(data.x)), (0, 0))) if rows.ndim else rows, data)
 
 
 def minibatch(key: Key, data: Dataset, rows: int) -> Batch:
     """`rows` rows drawn with replacement from those in use."""
     index: Array = jax.random.randint(key, (rows,), 0, data.size)
-    return Batch(data.x[index], data.u[index], data.y[index])
+    return Batch(*(jnp.asarray(values)[index] for values in (data.x, data.u, data.y)))

@@ -13,7 +13,7 @@ __all__ = ["difference", "encode", "feature_names", "wrap"]
 def encode(x: Array, angles: tuple[int, ...]) -> Array:
     """Features [..., F] of states x [..., D]: the other dimensions, then all sines, then all cosines; F = D + A.
 
-    Raises ValueError for an angle that is none of the D dimensions.
+    Raises ValueError for an angle that is none of the D dimensions, or named twice.
     """
     check_places(angles, x.shape[-1])
     plain = pick(x, [i for i in range(x.shape[-1]) if i not in angles])
@@ -22,10 +22,12 @@ def encode(x: Array, angles: tuple[int, ...]) -> Array:
 
 
 def check_places(angles: tuple[int, ...], size: int) -> None:
-    """Raises ValueError unless the indices of angles are dimensions, from 0 on; JAX would take others, or none."""
+    """Raises ValueError unless these are different dimensions, from 0 on; JAX would take others, or none."""
     for angle in angles:
         if not 0 <= angle < size:
             raise ValueError(f"angles={angles} has {angle}; expected indices from 0 to {size - 1}")
+        if list(angles).count(angle) > 1:
+            raise ValueError(f"angles={angles} has {angle} twice; expected different indices")
 
 
 def pick(x: Array, indices: Sequence[int]) -> Array:
@@ -34,7 +36,8 @@ def pick(x: Array, indices: Sequence[int]) -> Array:
 
 
 def feature_names(names: tuple[str, ...], angles: tuple[int, ...]) -> tuple[str, ...]:
-    """Names of the features of `encode`, in its order."""
+    """Names of the features of `encode`, in its order. Raises ValueError as it does."""
+    check_places(angles, len(names))
     plain = tuple(name for i, name in enumerate(names) if i not in angles)
     return plain + tuple(f"sin {names[i]}" for i in angles) + tuple(f"cos {names[i]}" for i in angles)
 
@@ -46,6 +49,6 @@ def wrap(angle: Array) -> Array:
 
 def difference(after: Array, before: Array, angles: tuple[int, ...]) -> Array:
     """after - before [..., D], the angle dimensions wrapped: a roll that crosses 180 degrees has not jumped."""
-    change = after - before
+    change = jnp.asarray(after - before)
     check_places(angles, change.shape[-1])
     return change.at[..., np.array(angles, int)].set(wrap(change[..., np.array(angles, int)])) if angles else change
