@@ -3,6 +3,8 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -131,3 +133,16 @@ def test_what_was_parsed_survives_the_file(algorithm, tmp_path):
     assert loaded == chosen
     assert hash(loaded) == hash(chosen)
     assert jax.tree.leaves(config_io.override(loaded, {"trials": 20}).trials) == [20]
+
+
+def test_settings_of_numpy_are_numbers_and_lists():
+    """As a sweep over an array gives them."""
+    words = {
+        "trials": np.int64(3),
+        "search.steps": np.array(5),
+        "control_rate": [np.float32(0.5)],
+        "seed": jnp.int32(2),
+    }
+    config = config_io.override(Config(), config_io.values(words))
+    assert (config.trials, config.search.steps, config.control_rate, config.seed) == (3, 5, (0.5,), 2)
+    assert {type(number) for number in (config.trials, config.search.steps, config.seed)} == {int}

@@ -122,8 +122,18 @@ def without_random(words: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def values(words: Mapping[str, Any]) -> dict[str, Any]:
-    """What the texts on the right of `key=` mean, read as YAML; what is no text is a value already."""
-    return {key: _value(key, text) if isinstance(text, str) else text for key, text in words.items()}
+    """What the texts on the right of `key=` mean, read as YAML; what is no text is a value already, maybe NumPy's."""
+    return {key: _value(key, text) if isinstance(text, str) else _of_numpy(text) for key, text in words.items()}
+
+
+def _of_numpy(value: Any) -> Any:
+    """The value, whose numbers and arrays of NumPy or JAX are Python's numbers and lists of them."""
+    if isinstance(value, list | tuple):
+        return [*map(_of_numpy, value)]
+    try:
+        return value.tolist()
+    except AttributeError:
+        return value
 
 
 def override(config: Config, changes: dict[str, Any]) -> Config:
