@@ -226,7 +226,7 @@ def _checked(asked: Asked, mesh: Mesh) -> tuple[Config, Any]:
     if asked.resumed is not None:
         config = restore.moved(asked.resumed, asked.config, asked.mjcf)
         restore.announce(asked.resumed, config)
-        build(replace(config, seed=0), mesh)
+        build(config, mesh)
         return config, None
     config = first.found(resolve(asked.config))
     _, logs, notes = check.checked(asked.config, config, mesh)

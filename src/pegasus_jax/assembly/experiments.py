@@ -1,6 +1,7 @@
 """Config -> Experiment: the pieces that the settings name, or your own, composed."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -41,13 +42,13 @@ EXPLORATIONS = {"uniform": episode.uniform, "walk": episode.random_walk}
 def build(config: settings.Config, mesh: Mesh | None = None, logged: int = 0) -> Experiment:
     """The experiment of a config, with room for `logged` rows of data besides those of the trials.
 
-    Cached: the same config gives the same functions, which compile once, and the same environment, which is opened
-    once. Raises ConfigError for what is no config, and for a setting that its task does not use.
+    Cached: the same config, with any seed, gives the same functions, which compile once, and the same environment,
+    which is opened once. Raises ConfigError for what is no config, and for a setting that its task does not use.
     """
     if not isinstance(config, settings.Config):
         raise ConfigError(f"build takes a Config, not a {type(config).__name__}; compose(config, task) takes both")
     check_config(config)
-    return _built(config, mesh, logged)
+    return _built(replace(config, seed=0), mesh, logged)  # the seed is in the key that its functions are given
 
 
 @lru_cache(maxsize=64)

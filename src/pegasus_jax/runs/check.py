@@ -1,6 +1,5 @@
 """pegasus-check: what a task is like, and what would go wrong, before anything moves; pegasus-train asks it first."""
 
-from dataclasses import replace
 from typing import Any
 
 import jax.numpy as jnp
@@ -33,7 +32,7 @@ def checked(asked: Config, config: Config, mesh: Mesh | None = None) -> tuple[Ta
 
     Raises ConfigError, in one line, for whatever cannot be learned: all that is known before the first episode.
     """
-    task = build(replace(first.loaded(config), seed=0), mesh).task
+    task = build(first.loaded(config), mesh).task
     resets = 1 if asked.start_mean else RESETS  # who says where episodes start has nobody reset a robot
     logs, read = read_config(config, task)
     said = begin.checked(config, task) + first.checked(config, task) + unsaid(asked, config, task)

@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -54,7 +53,7 @@ def opened(
     """
     set_precision(config)
     loaded = first.loaded(config, run)
-    experiment = build(replace(loaded, seed=0), mesh, logs.rows)  # the seed is in the key: all share one program
+    experiment = build(loaded, mesh, logs.rows)
     try:
         rows = capacity(config, experiment.task, logs.rows)
         kept = traced.store(config, len(seeds), rows, alone=mesh is None)

@@ -5,7 +5,6 @@ They are trial 1: they take the place of a first episode of random controls.
 
 import glob
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -101,7 +100,7 @@ def of_config(config: Config, logs: Sequence[Logged] | None = None) -> Logs:
     """The logs that a config names, `logs` where they were read already. Raises ConfigError for what cannot be."""
     if not has(config):
         return NONE
-    known = read_config(config, build(replace(config, seed=0)).task)[0] if logs is None else logs
+    known = read_config(config, build(config).task)[0] if logs is None else logs
     return Logs(rows(known), lambda: list(known))
 
 
