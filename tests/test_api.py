@@ -828,6 +828,26 @@ def test_a_task_is_no_config() -> None:
         pg.train(TASK)  # type: ignore[arg-type]
 
 
+MISUSED: list[tuple[Callable[[], Any], str]] = [
+    (lambda: pg.train(CONFIG, seeds="2"), r"seeds=2 is not a whole number as written, '2'; write seeds=2"),  # type: ignore[arg-type]
+    (lambda: pg.train(CONFIG, seeds=2.0), r"seeds=2 is not a whole number as written, 2\.0; write seeds=2"),  # type: ignore[arg-type]
+    (lambda: pg.compose(CONFIG, TASK, mesh=2), r"mesh=2 is no Mesh; pegasus_jax\.sharding\.mesh"),  # type: ignore[arg-type]
+    (lambda: pg.dynamics_of("bnn", TASK), r"dynamics_of takes a config's model, not a str; preset\(NAME\)\.model"),  # type: ignore[arg-type]
+    (lambda: pg.run(CONFIG, 2), r"run takes an Experiment, not a Config; build\(config\) makes one"),  # type: ignore[arg-type]
+    (lambda: pg.trial(None, CONFIG), r"trial takes an Experiment, not a Config"),  # type: ignore[arg-type]
+    (
+        lambda: pg.config.Search(period=pg.Period()),
+        r"search\.period=\[1,.*\] is not a pegasus_jax\.config\.Period; for",
+    ),  # type: ignore[arg-type]
+]
+
+
+@pytest.mark.parametrize(("call", "message"), MISUSED)
+def test_what_is_of_another_kind_is_told_in_one_line(call: Callable[[], Any], message: str) -> None:
+    with pytest.raises(ValueError, match=f"^{message}"):
+        call()
+
+
 def test_controls_of_a_policy_of_your_own_are_cut_off_at_the_limits() -> None:
     wild = POLICY._replace(apply=lambda params, noise, x: 100 * x[:1])
     experiment = pg.compose(CONFIG, TASK, policy=wild)

@@ -78,8 +78,8 @@ def test_a_trial_is_chosen(runs: dict[str, Path]) -> None:
     assert [chosen[trial].trial for trial in chosen] == [1, 2, 3, 2, 3]
     np.testing.assert_array_equal(chosen["best"](X), chosen[2](X))
     assert np.all(chosen["last"](X) != chosen[2](X))
-    for wrong in (4, "first"):
-        with pytest.raises(RunError, match=f"no checkpoint of trial={wrong}; choose from 1, 2, 3, best, last"):
+    for wrong in (4, "first", "1"):
+        with pytest.raises(RunError, match=f"no checkpoint of trial={wrong!r}; choose from 1, 2, 3, best, last"):
             pegasus_jax.controller(run, trial=wrong)
 
 

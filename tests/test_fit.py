@@ -194,8 +194,13 @@ def test_more_data_does_not_trace_again():
     [
         (
             lambda: minibatches(None, optax.adam(1e-3), batch_size=5.5),
-            "batch_size=5.5 is not a whole number; the nearest is 6",
+            "batch_size=5.5 is not a whole number; for example batch_size=6",
         ),
+        (
+            lambda: minibatches(None, optax.adam(1e-3), batch_size=5.0),
+            "batch_size=5 is not a whole number as written, 5.0; write batch_size=5",
+        ),
+        (lambda: minibatches(None, optax.adam(1e-3), batch_size="10"), "as written, '10'; write batch_size=10"),
         (lambda: ensemble(None, members=0), "members=0 is out of range"),
     ],
 )

@@ -30,6 +30,7 @@ SIZES = {
     "delay": 100,
     "eval_episodes": 10**5,
     "trials": 10**4,
+    "seeds": 10**4,
     "periods": 10**6,
     "rows": 10**7,
     "dt": 10**4,
@@ -100,11 +101,13 @@ def number(value: float) -> str:
     return str(int(value)) if math.isfinite(value) and value == int(value) else f"{value:g}"
 
 
-def size(name: str, value: int, low: int = 1) -> None:
+def size(name: str, value: float, low: int = 1) -> None:
     """Raises ConfigError unless a size, the last part of the setting's name in SIZES, is at least `low` and sane."""
-    check_range(name, value, low, SIZES[name.rpartition(".")[2]])
-    if value % 1:
-        raise ConfigError(f"{name}={value} is not a whole number; the nearest is {value:.0f}")
+    if isinstance(value, numbers.Real):
+        check_range(name, value, low, SIZES[name.rpartition(".")[2]])
+    if not isinstance(value, numbers.Integral):  # 5.0 would end inside of JAX
+        near = round(value) if isinstance(value, numbers.Real) else low
+        raise ConfigError(f"{name}={shown(value)} is not {expected(name, int, value, near)}")
 
 
 def sizes(section: str, config: Any, *names: str, low: int = 1) -> None:
@@ -243,7 +246,7 @@ def called(kind: Any) -> str:
         FUNCTION: "a word or null",
         int | None: "a whole number or null",
         float | None: "a number or null",
-    }.get(kind, "one of its kinds")
+    }.get(kind, f"a {kind.__module__}.{kind.__name__}" if isinstance(kind, type) else "one of its kinds")
 
 
 def shown(value: Any) -> str:

@@ -351,8 +351,15 @@ def _unknown(like: jax.ShapeDtypeStruct) -> Array:
     return jnp.full(like.shape, jnp.nan if jnp.issubdtype(like.dtype, jnp.floating) else 0, like.dtype)
 
 
+def _an_experiment(caller: str, exp: Any) -> None:
+    """Raises ValueError for what is none."""
+    if not isinstance(exp, Experiment):
+        raise ValueError(f"{caller} takes an Experiment, not a {type(exp).__name__}; build(config) makes one")
+
+
 def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunState, TrialInfo]:
     """One round of Alg. 1: collect, add_episode, improve; then `episodes` more, whose costs [E, H] are not data."""
+    _an_experiment("trial", exp)
     trajectory = exp.collect(state)
     state = exp.add_episode(state, trajectory)
     state, (fitted, searched) = exp.improve(state)
@@ -363,7 +370,7 @@ def trial(state: RunState, exp: Experiment, episodes: int = 20) -> tuple[RunStat
 
 def run(exp: Experiment, trials: int, episodes: int = 20) -> Callable[[Key], tuple[RunState, TrialInfo]]:
     """key -> (state, TrialInfo [T, ...]): a whole run as one function; jit(vmap(run(...)))(keys) is a study."""
-
+    _an_experiment("run", exp)
     if exp.drive is not None:
         raise ValueError(f"task {exp.task.name} has an environment, which no program can hold; use pegasus-train")
     room = jax.eval_shape(exp.init, jax.random.key(0)).data.x.shape[0] // exp.task.horizon

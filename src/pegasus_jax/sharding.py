@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
+from pegasus_jax.checks import ConfigError
+
 SEEDS, PARTICLES = "seeds", "particles"
 
 Spread = Callable[[Any, int], Any]  # (tree, its axis of particles) -> the same tree, laid out over devices
@@ -54,7 +56,9 @@ def pallas_allowed(x: Any) -> bool:
 
 
 def over_particles(over: Mesh | None) -> Spread:
-    """Lay the axis of particles out over the mesh's devices of that name."""
+    """Lay the axis of particles out over the mesh's devices of that name. Raises ConfigError for what is no mesh."""
+    if not isinstance(over, Mesh | None):
+        raise ConfigError(f"mesh={over!r} is no Mesh; pegasus_jax.sharding.mesh(seeds, particles) makes one")
     if over is None or over.shape[PARTICLES] == 1:
         return together
 

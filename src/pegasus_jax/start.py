@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from pegasus_jax.checks import SIZES, ConfigError, brief, check_range, shown
+from pegasus_jax.checks import ConfigError, brief, shown, size
 from pegasus_jax.config import Config, label
 from pegasus_jax.config_used import check_config, check_used, leaves
 from pegasus_jax.runs import trackers
@@ -118,8 +118,8 @@ def new(config: Config, out: str | Path | None, seeds: int) -> Asked:
     """A new run, or one of each of so many seeds, from config.seed on. Raises ConfigError for more than can be."""
     from pegasus_jax.runs import store  # it imports NumPy, which a refused command does not wait for
 
+    size("seeds", seeds)
     _one_environment(config, seeds)
-    check_range("seeds", seeds, 1, SIZES["trials"])
     name = f"seed{config.seed}" if seeds == 1 else f"seeds{config.seed}-{config.seed + seeds - 1}"
     home = Path(out) if out is not None else store.free(Path(f"runs/{label(config)}-{name}"))
     every = range(config.seed, config.seed + seeds)

@@ -61,6 +61,10 @@ def drawing_rates(fitter: ModelLearner, dynamics: Dynamics, task: Task) -> Model
 
 def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
     """The configured model of a task's dynamics. Raises ConfigError where the task does not suit it."""
+    if not isinstance(config, settings.Model):
+        raise ConfigError(
+            f"dynamics_of takes a config's model, not a {type(config).__name__}; preset(NAME).model is one"
+        )
     states, controls = len(task.state_names), given_size(task.memory, len(task.control_names))
     if task.prior is not None and (task.hindsight is not None or controls != len(task.control_names)):
         raise ConfigError(

@@ -80,7 +80,7 @@ def _state(run: Path, trial: Trial, like: RunState) -> RunState:
     there = checkpoint.available(run)
     choices = ", ".join([*map(str, sorted(there)), BEST, LAST])
     if number not in there:
-        raise RunError(f"{run} has no checkpoint of trial={number}; choose from {choices}")
+        raise RunError(f"{run} has no checkpoint of trial={number!r}; choose from {choices}")
     if problem := checkpoint.damage(run, int(number)):
         raise RunError(problem)
     return checkpoint.restore(run, int(number), like)
