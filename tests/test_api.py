@@ -848,6 +848,20 @@ def test_what_is_of_another_kind_is_told_in_one_line(call: Callable[[], Any], me
         call()
 
 
+def test_a_searcher_that_returns_the_learner_alone_is_named() -> None:
+    """A learner is a pair too, of parameters and an optimizer's state."""
+    alone = pg.PolicyOptimizer(lambda params: (), lambda key, learner, *_, **__: learner)
+    experiment = pg.compose(CONFIG, TASK, searcher=alone)
+    with pytest.raises(ValueError, match=r"^searcher\.run returns a dict first; expected \(TrainState, SearchInfo\)"):
+        jax.eval_shape(experiment.search, jax.eval_shape(experiment.init, key()))
+
+
+def test_a_policy_that_remembers_what_its_task_does_not_is_refused() -> None:
+    slow = pg.compose(replace(CONFIG, control_rate=(1.0,)), TASK)
+    with pytest.raises(pg.ConfigError, match=r"^the policy remembers force 1 before, and the task nothing; expected"):
+        pg.compose(CONFIG, TASK, policy=slow.policy)
+
+
 def test_controls_of_a_policy_of_your_own_are_cut_off_at_the_limits() -> None:
     wild = POLICY._replace(apply=lambda params, noise, x: 100 * x[:1])
     experiment = pg.compose(CONFIG, TASK, policy=wild)

@@ -235,6 +235,10 @@ def experiment(
             fresh=fresh,
             **({"works": worked + jnp.int32(compare & came_back(state))} if refine_successes else {}),
         )
+        if not isinstance(learner, TrainState):  # which unpacks into two, too
+            raise ValueError(
+                f"searcher.run returns a {type(learner).__name__} first; expected (TrainState, SearchInfo)"
+            )
         return state._replace(policy=learner), info
 
     def chance_of(rolled: Rollout) -> Any:

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from pegasus_jax.checks import ConfigError, RunError, shown
+from pegasus_jax.checks import ConfigError, RunError, shown, some
 from pegasus_jax.imagine.limits import Constraint
 from pegasus_jax.learn.data import empty
 from pegasus_jax.memory import given_size, seen_names
@@ -109,6 +109,11 @@ def try_policy(policy: Policy, task: Task, follows: bool) -> None:
     `follows` says whether it follows a gradient: a searcher of one's own may have no use for one.
     """
     call = partial(called, "policy", policy)
+    if policy.memory.names not in ((), task.memory.names):
+        raise ConfigError(
+            f"the policy remembers {some(policy.memory.names)}, and the task {some(task.memory.names) or 'nothing'};"
+            " expected the memory= of the task"
+        )
 
     def each(key: Key) -> None:
         first, second = jax.random.split(key)
