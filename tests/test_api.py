@@ -848,6 +848,14 @@ def test_what_is_of_another_kind_is_told_in_one_line(call: Callable[[], Any], me
         call()
 
 
+def test_a_policy_for_a_goal_takes_the_composed_task() -> None:
+    cost = lambda x, goal: 1 - jnp.exp(-jnp.sum((x[:1] - goal) ** 2))  # noqa: E731
+    task = TASK._replace(goal=Signal(lambda key: jax.random.uniform(key, (1,)), (1.0,)), cost=cost)
+    policy = pg.policy_of(CONFIG.policy, pg.compose(CONFIG, task).task)
+    experiment = pg.compose(CONFIG, task, policy=policy)
+    assert jax.eval_shape(experiment.collect, jax.eval_shape(experiment.init, key())).u.shape == (H, U)
+
+
 def test_a_searcher_that_returns_the_learner_alone_is_named() -> None:
     """A learner is a pair too, of parameters and an optimizer's state."""
     alone = pg.PolicyOptimizer(lambda params: (), lambda key, learner, *_, **__: learner)

@@ -88,8 +88,8 @@ class Dropout(NamedTuple):
     sample: Callable[[Key, int], Array]  # (key, width) -> base noise [width], free of parameters
     mask: Callable[[Params, Array], Array]  # (params, base noise [width]) -> z [width]
     kl: Callable[[Params], Array]  # KL(q || prior) summed over units [nats]
-    retain: Callable[[Params], Array]  # E[z] [width]
-    decay: Callable[[Params], Array]  # [width] factor of |W_i|^2 / 2 in the weight prior of the unit's outgoing weights
+    retain: Callable[[Params], Array]  # E[z] [width]; [] where it is one number for all units
+    decay: Callable[[Params], Array]  # [width] or [], factor of |W_i|^2 / 2 in the prior of the unit's outgoing weights
 
 
 class Dynamics(NamedTuple):
