@@ -43,7 +43,9 @@ def build(config: settings.Config, mesh: Mesh | None = None, logged: int = 0) ->
     """The experiment of a config, with room for `logged` rows of data besides those of the trials.
 
     Cached: the same config, with any seed, gives the same functions, which compile once, and the same environment,
-    which is opened once. Raises ConfigError for what is no config, and for a setting that its task does not use.
+    which is opened once. Its functions have JAX's precision when they run: x64=True needs `jax_enable_x64`, which
+    `train` and the commands set. Raises ConfigError for what is no config, and for a setting that its task does not
+    use.
     """
     if not isinstance(config, settings.Config):
         raise ConfigError(f"build takes a Config, not a {type(config).__name__}; compose(config, task) takes both")
@@ -80,10 +82,11 @@ def compose(
     `searcher` improves the policy for `config.search.steps` steps; what is imagined after a search is as
     configured. There is room for `logged` rows of data besides those of the trials. Controls of a policy of your
     own beyond the task's limits are cut off at them, in imagination as on the plant. With a `mesh` (sharding.py)
-    the particles of a search are spread over its devices. Raises ConfigError for what is no piece, a task whose
-    fields do not agree, a setting of what the task is that it is not, as another horizon, a constraint or sensors, and
-    a piece that does not suit the config: moment matching, for example, needs more particles than states. A plant of
-    your own that is late says so: `task._replace(late=2)` goes with `sensors.delay=2`.
+    the particles of a search are spread over its devices. With x64=True set `jax_enable_x64`, as `train` does, before
+    its functions run. Raises ConfigError for what is no piece, a task whose fields do not agree, a setting of what the
+    task is that it is not, as another horizon, a constraint or sensors, and a piece that does not suit the
+    config: moment matching, for example, needs more particles than states. A plant of your own that is late says so:
+    `task._replace(late=2)` goes with `sensors.delay=2`.
     """
     _of_kinds(config=config, task=task, dynamics=dynamics, policy=policy, fitter=fitter, searcher=searcher)
     agree(config, task)
