@@ -53,6 +53,15 @@ def test_the_probability_is_the_share_of_trajectories_that_leave_the_limits():
     assert limits.probability(path(1.2, 0, 0), RAIL) == 0
 
 
+@given(st.lists(st.tuples(st.floats(0, 1), st.sampled_from([0.0, 0.05, 0.1, 0.3, 0.9])), min_size=2, max_size=5))
+def test_the_first_of_several_is_the_one_that_wins_over_each_other(several: list[tuple[float, float]]) -> None:
+    cost, chance = np.array(several, np.float32).T
+    first = int(np.argmin(limits.ranked(jnp.asarray(cost), jnp.asarray(chance), bound=0.1)))
+    for other in range(len(several)):
+        cheaper = jnp.asarray(cost[first] <= cost[other])
+        assert limits.prefers(cheaper, jnp.asarray(chance[first]), jnp.asarray(chance[other]), bound=0.1)
+
+
 def test_a_constraint_of_one_number_is_that_of_a_vector_of_one():
     alone, paths = RAIL._replace(of_state=lambda x: jnp.abs(x[0]) - 1), path(0, 0.9, 1.3)
     for function in (limits.probability, limits.penalty):

@@ -11,7 +11,7 @@ import pytest
 
 from pegasus_jax import config
 from pegasus_jax.assembly.experiments import compose
-from pegasus_jax.assembly.searchers import fresh_policies
+from pegasus_jax.assembly.searchers import fresh_policies, judged
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine import limits
 from pegasus_jax.imagine.scenarios import Sampler
@@ -19,7 +19,7 @@ from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.learn.multistart import best_of
 from pegasus_jax.learn.schedule import search_table
 from pegasus_jax.learn.search import Problem, searcher
-from pegasus_jax.types import PolicyOptimizer, TrainState
+from pegasus_jax.types import PolicyOptimizer, Rollout, TrainState
 from probes import cart, noisy_linear_policy, regression, same, tiny, unchecked
 
 STARTS, STEPS, DEEPER = 4, 60, 0.1
@@ -141,10 +141,35 @@ def test_a_constraints_multiplier_goes_on_from_search_to_search(lasting, went_on
         np.testing.assert_allclose(rises(second), expected, rtol=1e-5, atol=1e-5)
 
 
+RAIL = limits.Constraint(lambda x: x[:1] - 1, 0.1)
+
+
+def test_of_several_under_a_constraint_the_one_that_keeps_it_goes_on():
+    """Its objective counts the constraint by a multiplier of its own, and is no measure of it."""
+
+    def value(p, posterior, target, row, multiplier):
+        return -p, jnp.asarray(p > 1, float)
+
+    def imagine(key, p, posterior):
+        x = jnp.full((4, 3, 1), p)
+        return Rollout(x.at[0].set(0), x, x), -x[1:, :, 0]
+
+    still = Sampler(lambda *_: jnp.zeros(()), lambda *_: jnp.zeros(()))
+    problem = Problem(value, still, optax.sgd(0.0), search_table(3), ascend=partial(limits.ascend, bound=RAIL.bound))
+    judge = partial(judged, imagine=imagine, task=cart()._replace(constraint=RAIL))
+    for way, expected in ((None, 3.0), (judge, 0.9)):
+        best = best_of(searcher(problem), num_starts=3, window=1, judge=way)
+        begun = TrainState(jnp.float32(0.2), best.init(jnp.float32(0.2)))
+        found, _ = best.run(jax.random.key(0), begun, None, first=0, steps=3, fresh=jnp.array([0.9, 3.0]))
+        np.testing.assert_allclose(found.params, expected)
+
+
 @pytest.mark.slow
-def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best():
+@pytest.mark.parametrize("constraint", [None, RAIL])
+def test_a_whole_experiment_keeps_its_shapes_and_executes_the_best(constraint):
     chosen = tiny(trials=2, fit__steps=5, search__steps=4, search__particles=5, search__num_starts=3)
-    exp = compose(chosen, cart(), dynamics=regression(2, 1), policy=noisy_linear_policy(cart()))
+    task = cart()._replace(constraint=constraint)
+    exp = compose(chosen, task, dynamics=regression(2, 1), policy=noisy_linear_policy(cart()))
     state = exp.init(jax.random.key(0))
     after, (_, info) = unchecked(jax.jit(lambda s: exp.improve(exp.add_episode(s, exp.collect(s)))))(state)
     shapes = [jax.tree.map(lambda leaf: (leaf.shape, leaf.dtype), tree) for tree in (state.policy, after.policy)]

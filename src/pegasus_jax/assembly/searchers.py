@@ -4,6 +4,7 @@ from collections.abc import Callable
 from functools import cache, partial
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import optax
 
@@ -143,18 +144,27 @@ def search_of(
     draws = scenarios.sampler(searched, Period(**vars(search.period)))
     more: dict[str, Any] = dict(reset_optimizer=search.reset_optimizer, ascend=ascend)
     found = tabled(init_of(search), table, lambda rows: searcher(Problem(value, draws, optimizer, rows, **more)))
-    if search.num_starts > 1:
-        lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
-        # What refines may end with another than its last.
-        window = 1 if search.refine_fraction else max(1, search.steps // 20)
-        found = best_of(found, num_starts=search.num_starts, window=window, lasting=lasting)
     # A refined policy is good for particles, not for their Gaussian.
     seen_last = matching.keep if refines else match
     imagine = partial(imagined, **pieces, match=seen_last, task=task)
+    if search.num_starts > 1:
+        judge = None if constraint is None else partial(judged, imagine=partial(imagine, blocks=blocks), task=task)
+        lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
+        # What refines may end with another than its last.
+        window = 1 if search.refine_fraction else max(1, search.steps // 20)
+        found = best_of(found, num_starts=search.num_starts, window=window, lasting=lasting, judge=judge)
     if not search.visited_starts:
         return Searching(found, partial(imagine, blocks=blocks))
     mixed = blocks._replace(start=lambda *given: searched.start(*given).mixed)
     return Searching(found, partial(imagine, blocks=blocks), lambda *given: jnp.mean(imagine(*given, blocks=mixed)[1]))
+
+
+def judged(key: Key, members: Params, posterior: Params, *, imagine: Imagine, task: Task) -> Array:
+    """[N] of policies with the parameters `members` [N, ...] under the same fresh scenarios: the lowest is the best."""
+    constraint = task.constraint
+    rolled, costs = jax.vmap(imagine, (None, 0, None))(key, members, posterior)
+    chance = jax.vmap(partial(limited.probability, constraint=constraint))(rolled.x)
+    return limited.ranked(jnp.mean(costs, (1, 2)), chance, bound=constraint.bound)
 
 
 def matching_of(search: settings.Search, task: Task) -> Matching:

@@ -71,6 +71,15 @@ def prefers(cheaper: Array, chance: Array, other: Array, *, bound: float) -> Arr
     return (beyond < before) | (beyond == before) & cheaper
 
 
+def ranked(cost: Array, chance: Array, *, bound: float) -> Array:
+    """[N] numbers of N policies whose lowest is that of one which `prefers` lets win over all others.
+
+    Of those that break the constraint least, or within its bound, it is their `cost` [N], of the others infinite.
+    """
+    beyond = jnp.maximum(chance, bound)
+    return jnp.where(beyond <= jnp.min(beyond), cost, jnp.inf)
+
+
 def constrained(
     policy_params: Params,
     posterior: Params,

@@ -1,11 +1,14 @@
 """Several policies searched side by side. The best goes on: to the plant, and where they do not last, alone."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from pegasus_jax.types import Array, Key, Params, PolicyOptimizer, TrainState
+
+JUDGE = 2**31 - 1  # what a search's key is folded with: no iteration has that number
 
 
 def best_of(
@@ -14,6 +17,7 @@ def best_of(
     num_starts: int,
     window: int,
     lasting: bool = False,
+    judge: Callable[[Key, Params, Params], Array] | None = None,
 ) -> PolicyOptimizer:
     """The searcher that searches from `num_starts` policies under the same scenarios, all of them until the trial ends.
 
@@ -21,8 +25,9 @@ def best_of(
     first search where they are `lasting`, and then each goes on from trial to trial, whichever is the best. What
     `searcher` keeps from search to search, such as a constraint's multiplier, is a lasting member's own; the others
     begin with what the given policy's member knows. The learner's parameters are always those of the member with the
-    lowest mean objective over the last `window` iterations, or as many as there were. Its optimizer is all members: a
-    `TrainState` [num_starts, ...].
+    lowest mean objective over the last `window` iterations, or as many as there were; or with the lowest number of
+    `judge(key, members' parameters, posterior)` [num_starts], where objectives cannot be compared: each counts a
+    constraint by its own multiplier. Its optimizer is all members: a `TrainState` [num_starts, ...].
     """
 
     def init(params: Params) -> TrainState:
@@ -56,7 +61,10 @@ def best_of(
         members = jax.lax.cond(jnp.asarray(first) == 0, begun, lambda: learner.optimizer)
         search = lambda member: searcher.run(key, member, posterior, first=first, steps=steps, earlier=earlier)  # noqa: E731
         members, info = jax.vmap(search)(members)
-        values = jnp.mean(info.objective[:, -window:], 1)
+        if judge is None:
+            values = jnp.mean(info.objective[:, -window:], 1)
+        else:
+            values = judge(jax.random.fold_in(key, JUDGE), members.params, posterior)
         best = jnp.argmin(jnp.where(jnp.isnan(values), jnp.inf, values))
         params, info = jax.tree.map(lambda leaf: leaf[best], (members.params, info))
         return TrainState(params, members), info
