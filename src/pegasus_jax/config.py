@@ -41,10 +41,10 @@ class Fit:
     """Model learning after each trial, by Adam on minibatches."""
 
     kind: str = setting("adam", "")
-    steps: int = setting(2000, "updates a trial")
-    batch_size: int = setting(100, "rows an update")
+    steps: int = setting(2000, "updates in a trial")
+    batch_size: int = setting(100, "rows in an update")
     learning_rate: float = setting(3e-4, "Adam's step size")
-    decay: float = setting(1.0, "step size at the end of a fit, as a fraction of that at its start")
+    decay: float = setting(1.0, "step size at the end of a fit, divided by that at its start")
 
     def __post_init__(self) -> None:
         checks.typed("fit", self)
@@ -59,8 +59,8 @@ class LBFGS:
     """Model learning after each trial, by L-BFGS on all data."""
 
     kind: str = setting("lbfgs", "")
-    steps: int = setting(300, "iterations a trial, at most")
-    num_starts: int = setting(100, "fresh parameters, of which the best, or the current ones, begin")
+    steps: int = setting(300, "largest number of iterations in a trial")
+    num_starts: int = setting(100, "random starts; the best of them, or the current parameters, begin the fit")
 
     def __post_init__(self) -> None:
         checks.typed("fit", self)
@@ -72,11 +72,11 @@ class LBFGS:
 class Period:
     """For how many iterations each draw of the scenarios is kept; 0: the whole search of a trial."""
 
-    start: int = setting(1, "first states")
-    dynamics: int = setting(100, "draws of the model")
-    policy: int = setting(1, "draws of the policy")
-    sensor: int = setting(1, "noise on what the policy sees")
-    match: int = setting(1, "noise of the moment matching")
+    start: int = setting(1, "iterations for which the first states are kept; 0: the whole search")
+    dynamics: int = setting(100, "iterations for which the draws of the model are kept; 0: the whole search")
+    policy: int = setting(1, "iterations for which the draws of the policy are kept; 0: the whole search")
+    sensor: int = setting(1, "iterations for which the noise on what the policy sees is kept; 0: the whole search")
+    match: int = setting(1, "iterations for which the noise of moment matching is kept; 0: the whole search")
 
     def __post_init__(self) -> None:
         checks.typed("search.period", self)
@@ -89,54 +89,54 @@ class Search:
     """Policy search after each fit, along the gradient of imagined rollouts of particles."""
 
     kind: str = setting("particles", "")
-    steps: int = setting(1000, "iterations a trial")
-    particles: int = setting(100, "K, imagined rollouts an iteration")
+    steps: int = setting(1000, "iterations in a trial")
+    particles: int = setting(100, "K, the number of imagined rollouts in an iteration")
     learning_rate: float = setting(1e-3, "Adam's step size")
-    decay: float = setting(1.0, "step size at the end of a search, as a fraction of that at its start")
+    decay: float = setting(1.0, "step size at the end of a search, divided by that at its start")
     grad_clip: float | None = setting(1.0, "largest global norm of the gradient; null: no clipping")
     matching: str = setting(
-        "always", "moment matching: always; narrow: where no angle spreads over more than 1 rad; or never"
+        "always", "moment matching: always; narrow, unless an angle spreads over more than 1 rad; or never"
     )
     standardized_noise: bool = setting(
-        False, "make the drawn noise exactly zero mean, unit covariance over the particles"
+        False, "give the drawn noise exactly zero mean and unit covariance over the particles"
     )
     cost_estimator: str = setting(
         "gaussian", "gaussian: expected cost of the matched Gaussian; particles: mean cost of the particles"
     )
     refine_fraction: float = setting(
         0.0,
-        "last part of a search, as a fraction, which refines the better of the new policy and the old one;"
-        " after an episode that succeeded the only part",
+        "last fraction of a search, which only refines the better of the new policy and the old one; after an episode"
+        " that succeeded, usually the whole search",
     )
     cost_width_start: float | None = setting(
         None,
-        "the cost's width at the start of a search, as a factor; back to 1 by half of it. null: what lets it fall"
-        " where episodes start, 1 where it does so already; and it waits while all that is imagined costs nearly 1",
+        "factor by which the cost is wider at the start of a search; it is 1 from half of the search on. null: as wide"
+        " as the cost needs to fall where episodes start, and for as long as imagined episodes cost nearly 1",
     )
-    anneal_trials: int = setting(1, "trials over which cost_width_start= and decay= run down once; 1: in every search")
+    anneal_trials: int = setting(1, "number of trials that share one schedule of cost_width_start= and decay=")
     particle_grad_limit: float | None = setting(
         None,
-        "drop a particle's gradient with respect to its state where it is longer; null: with search.visited_starts="
-        " where the cost would change tenfold its range within the spread of the data, else never",
+        "drop a particle's gradient with respect to its state where its norm is larger; null: with"
+        " search.visited_starts=, where the spread of the data would change the cost by more than 10, else never",
     )
     warm_restart: float = setting(
-        0.0, "after `anneal_trials`: step size at the start of each search, as a fraction; 0: constant"
+        0.0, "step size at the start of each search after the first anneal_trials, as a fraction; 0: constant"
     )
-    warm_limit_factor: float = setting(1.0, "factor of particle_grad_limit in the searches that warm_restart begins")
-    reset_optimizer: bool = setting(True, "forget Adam's moments at each trial")
+    warm_limit_factor: float = setting(1.0, "factor of particle_grad_limit in searches that warm_restart begins")
+    reset_optimizer: bool = setting(True, "reset Adam's moments in each trial")
     init: str = setting(
         "better",
-        "what a search starts from: the previous policy; a fresh one; the better of both; or raced, the better of both"
-        " after a quarter of the search before it refines for each; of search.num_starts= one is the previous",
+        "policy that a search starts from: previous; fresh, a random one; better, the better of both; raced, the better"
+        " of both after a part of the search for each; of search.num_starts= one is the previous",
     )
     num_starts: int = setting(
-        1, "policies searched side by side, the best of which goes on: the old one and fresh ones"
+        1, "number of policies searched side by side, the old one and random ones; the best one is kept"
     )
     observation_noise: str = setting(
-        "model", "whose noise is on what the policy sees: the model's prediction, or the plant's, where it is known"
+        "model", "noise on what the policy sees: model, as the model predicts it; plant, where the plant's is known"
     )
     visited_starts: float = setting(
-        0.0, "share of the imagined rollouts that start where the plant has been, while a search refines"
+        0.0, "share of the imagined rollouts that start at states of the data, while a search refines"
     )
     policy_noise: float = setting(1.0, "factor of the noise on what the policy sees")
     state_noise: float = setting(0.0, "factor of the predicted noise added to the state")
@@ -190,9 +190,9 @@ class Analytic:
     """Policy search after each fit, PILCO's: L-BFGS on the expected cost of a Gaussian, propagated analytically."""
 
     kind: str = setting("analytic", "")
-    steps: int = setting(300, "iterations of L-BFGS a trial, at most")
-    particles: int = setting(100, "K, rollouts imagined afterwards for the record; the search has none")
-    init: str = setting("better", "what a search starts from: the previous policy, or the better of it and a fresh one")
+    steps: int = setting(300, "largest number of L-BFGS iterations in a trial")
+    particles: int = setting(100, "K, the number of rollouts imagined after the search, for the record")
+    init: str = setting("better", "start of a search: the previous policy, or the better of it and a random one")
     policy_noise: float = setting(1.0, "factor of the model's noise on what the policy sees")
     state_noise: float = setting(1.0, "factor of the model's noise added to the state")
     # No settings: curvature is of one model, and one Gaussian starts.
@@ -212,13 +212,13 @@ class Config:
     """One run."""
 
     task: str = setting("cartpole", "what to learn")
-    seed: int = setting(0, "all randomness of the run comes from it")
-    trials: int = setting(15, "episodes on the plant, the random ones included")
-    eval_episodes: int = setting(20, "episodes after each trial that only measure the policy; 0: none, as for a robot")
+    seed: int = setting(0, "all random numbers of the run come from it")
+    trials: int = setting(15, "number of trials, each with one episode; the first have random controls")
+    eval_episodes: int = setting(20, "further episodes after each trial, which only measure the policy; 0 for a robot")
     successor: str = setting(
-        "always", "which policy runs next: always the new one, or the better one as expected under the new model"
+        "always", "policy that runs next: always the new one; better, the one with the lower cost under the new model"
     )
-    x64: bool = setting(False, "numbers of 64 bits, not 32")
+    x64: bool = setting(False, "compute in double precision")
     model: Model = BNN()  # noqa: RUF009 (frozen)
     policy: MLP | RBF | Linear = MLP()  # noqa: RUF009 (frozen)
     fit: Fit | LBFGS = Fit()
@@ -226,81 +226,85 @@ class Config:
     explore: Explore = Explore()  # noqa: RUF009 (frozen)
     # The plant: its sensors, and what the task leaves to you: of a gym's or an mjcf's task, and a swimmer's legs.
     sensors: Sensors = setting(Sensors(), "", EVERY)  # noqa: RUF009 (frozen)
-    history: int = setting(1, "observations and controls that make a state, the newest and those before it", EVERY)
-    legs: int = setting(2, "that the swimmer drives: 2 or 6", ("swimmer_*",))
+    history: int = setting(1, "how many of the newest observations and controls make a state", EVERY)
+    legs: int = setting(2, "number of legs that the swimmer drives: 2 or 6", ("swimmer_*",))
     env: str | None = setting(None, "the environment's Gymnasium id", (GYM,))
     mjcf: str | None = setting(None, "the MuJoCo file, path/to/model.xml", (MJCF,))
     cost: str | Callable | None = setting(  # noqa: RUF009 (frozen)
         None,
-        "module:function in JAX, (observation [D], maybe u, previous_u, t, reference, goal) -> cost in [0, 1]",
+        "module:function in JAX, observation [D], and maybe u, previous_u, t, reference, goal -> cost in [0, 1]",
         EVERY,
     )
     reference: str | Callable | None = setting(  # noqa: RUF009 (frozen)
-        None, "what the cost's reference is: a file .csv or .npz, or module:function of the time [s], in JAX", EVERY
+        None, "reference that the cost takes: a file .csv or .npz, or module:function of the time [s], in JAX", EVERY
     )
-    goal_low: tuple[float, ...] = setting((), "least goals of episodes, drawn uniformly; [] where none are", EVERY)
-    goal_high: tuple[float, ...] = setting((), "greatest goals", EVERY)
+    goal_low: tuple[float, ...] = setting((), "lower limits of an episode's goal, drawn uniformly; []: no goal", EVERY)
+    goal_high: tuple[float, ...] = setting((), "upper limits of the goal", EVERY)
     goals: str | Callable | None = setting(None, "module:function in JAX, key -> an episode's goal", EVERY)  # noqa: RUF009 (frozen)
     angles: tuple[int, ...] = setting((), "the entries of the observation that are angles [rad]", OWN)
-    rates: tuple[int, ...] = setting((), "the entries that are the other entries' rates, in their order", (GYM,))
+    rates: tuple[int, ...] = setting((), "the entries that are rates of the other entries, in their order", (GYM,))
     circles: tuple[tuple[int, ...], ...] | None = setting(
-        None, "as [[0,1]]: entries that are cosine and sine of one angle; null: found on 100 resets; []: none", (GYM,)
+        None, "entries that are cosine and sine of one angle, as [[0,1]]; null: found on 100 resets; []: none", (GYM,)
     )
-    horizon: int | None = setting(None, "control periods an episode; null: a gym's own limit, or 100", OWN)
+    horizon: int | None = setting(None, "control periods in an episode; null: the environment's own limit, or 100", OWN)
     dt: float | None = setting(
-        None, "control period [s]; null: a gym's own. A whole number of an mjcf's time steps", OWN
+        None, "control period [s]; null: the environment's own. A MuJoCo file: a whole number of its time steps", OWN
     )
     env_args: tuple[str, ...] = setting(
-        (), "arguments of its own, each as env_args.port=/dev/ttyACM0; of a cart-pole env_args.pole_mass=0.4", CONSTANTS
+        (),
+        "arguments of the environment, as env_args.port=/dev/ttyACM0; of a cart-pole env_args.pole_mass=0.4",
+        CONSTANTS,
     )
     state_names: tuple[str, ...] = setting(
         (),
-        """of the observation, as '["angle [rad]","rate [rad/s]"]'; []: the environment's own, or x0, x1, ...""",
+        """names of the observation, as '["angle [rad]","rate [rad/s]"]'; []: the environment's, or x0, x1, ...""",
         (GYM,),
     )
-    control_names: tuple[str, ...] = setting((), "of the controls; []: the environment's own, or u0, u1, ...", (GYM,))
+    control_names: tuple[str, ...] = setting((), "names of the controls; []: the environment's, or u0, u1, ...", (GYM,))
     stop: str | Callable | None = setting(  # noqa: RUF009 (frozen)
         None, "module:function, observation [D] -> probability that an episode ends there, in JAX", OWN
     )
-    stop_cost: float = setting(1.0, "of each control period that an early end leaves out", OWN)
+    stop_cost: float = setting(1.0, "cost of each control period that an episode lacks because it ended early", OWN)
     constraint: str | Callable | None = setting(  # noqa: RUF009 (frozen)
-        None, "module:function, observation [D] -> numbers, each at most 0 where a policy may be, in JAX", EVERY
+        None, "module:function in JAX, observation [D] -> numbers, above 0 where a limit is broken", EVERY
     )
-    constraint_bound: float = setting(0.05, "most probable share of the episodes that break the constraint", EVERY)
+    constraint_bound: float = setting(0.05, "largest probability that an episode breaks the constraint", EVERY)
     control_rate: tuple[float, ...] = setting(
-        (), "largest rate of change of a control [its unit per s], one for all or one each; []: any", EVERY
+        (), "most that a control may change in a second [its unit], one for all or one each; []: no limit", EVERY
     )
     observe: tuple[str, ...] = setting(
-        (), "of a file, as [qpos.0,qvel.1]; []: all positions, then all velocities", EVERY
+        (), "what is observed of a MuJoCo file, as [qpos.0,qvel.1]; []: all positions, then all velocities", EVERY
     )
-    control_low: tuple[float, ...] = setting((), "least controls; []: the action space's, the file's ctrlrange", OWN)
+    control_low: tuple[float, ...] = setting(
+        (), "least controls; []: of the action space, or the file's ctrlrange", OWN
+    )
     control_high: tuple[float, ...] = setting(
-        (), "greatest controls; []: the action space's, the file's ctrlrange", OWN
+        (), "greatest controls; []: of the action space, or the file's ctrlrange", OWN
     )
-    start_mean: tuple[float, ...] = setting((), "of the observation; []: of 100 resets, the file's pose at rest", OWN)
+    start_mean: tuple[float, ...] = setting((), "mean start; []: of 100 resets, or the file's pose at rest", OWN)
     start_std: tuple[float, ...] = setting(
-        (0.1,), "spread of the starts around start_mean, one for all or one each", OWN
+        (0.1,), "standard deviation of the starts around start_mean, one for all or one each", OWN
     )
     starts: tuple[tuple[float, ...], ...] = setting(
-        (), "observations where episodes start, equally likely; []: 100 resets, or as start_mean says", EVERY
+        (), "observations where episodes start, equally likely; []: as start_mean says, or 100 resets", EVERY
     )
-    success: float = setting(0.2, "the mean cost of an episode's last five steps is less than this", OWN)
+    success: float = setting(0.2, "an episode succeeds if its last five steps cost less than this on average", OWN)
     data: tuple[str, ...] = setting(
-        (), "logs that are trial 1: logs/*.csv, .npz, .mcap, .db3, .bag, or minari:NAME; [a,b] for several", ("*",)
+        (), "logs to use as trial 1: logs/*.csv, .npz, .mcap, .db3, .bag, or minari:NAME; [a,b] for several", ("*",)
     )
     data_columns: tuple[str, ...] = setting(
-        (), "their columns: the observation's, the controls'; NAME=COLUMN*FACTOR; []: by name, else in order", ("*",)
+        (), "their columns: the observation's, then the controls'; NAME=COLUMN*FACTOR; []: by name, else order", ("*",)
     )
-    data_control: str = setting("sent", "their controls are those sent at a row's time, or before: to reach it", ("*",))
+    data_control: str = setting("sent", "controls of a log's row: sent after its observation, or before it", ("*",))
     prior: str | Callable | None = setting(  # noqa: RUF009 (frozen)
         None,
-        "a simulator of the plant: module:function, (x [D], u [U]) -> x a period later, in JAX; or an MJCF file",
+        "a simulator of the plant: module:function in JAX, (x [D], u [U]) -> x one period later; or a MuJoCo file",
         EVERY,
     )
     init: str | None = setting(
-        None, "RUN, or RUN@TRIAL: another run with which this one begins, maybe of a simulator", EVERY
+        None, "another run to begin with, RUN or RUN@TRIAL, for example one in a simulator", EVERY
     )
-    init_parts: tuple[str, ...] = setting(("policy",), "what is taken from there: policy, model, data", EVERY)
+    init_parts: tuple[str, ...] = setting(("policy",), "what to take from the run of init=: policy, model, data", EVERY)
 
     def __post_init__(self) -> None:
         checks.typed("", self)

@@ -10,7 +10,7 @@ from pegasus_jax import checks
 def setting(default: Any, text: str, of: tuple[str, ...] = ()) -> Any:
     """A field with its help text, and of a plant's own the names of the tasks that use it, maybe with a *."""
     some = of and "*" not in of
-    return field(default=default, metadata={"help": f"of task={'|'.join(of)}: {text}" if some else text, "of": of})
+    return field(default=default, metadata={"help": f"{text} (task={'|'.join(of)})" if some else text, "of": of})
 
 
 DROPOUTS = ("log_normal", "binary", "concrete", "gaussian", "sparse", "none")
@@ -24,13 +24,13 @@ class _Network:
 
     kind: str = setting("", "")
     ensemble_size: int | None = setting(
-        1, "models fitted side by side, each particle follows one; null: 1 up to six states, 5 up to ten, else 20"
+        1, "number of models; each particle follows one of them; null: 1 up to six states, 5 up to ten, else 20"
     )
     hidden: tuple[int, ...] = setting((200, 200), "widths of the hidden layers")
     dropout: str = setting("log_normal", "noise on the units: log_normal, binary, concrete, gaussian, sparse, none")
-    log_z_min: float = setting(-10.0, "lower end of the interval of log z (log_normal), whose upper end is 0")
+    log_z_min: float = setting(-10.0, "lower end of the interval of log z, whose upper end is 0 (dropout log_normal)")
     kl_weight: float | None = setting(
-        0.1, "factor of the noise's KL divergence; 1 is the variational bound; null: 1 for several models, .1 for one"
+        0.1, "factor of the noise's KL divergence; 1: the variational bound; null: 1 for several models, .1 for one"
     )
     weight_decay: float = setting(1.0, "factor of the Gaussian prior on the weights")
     activation: str = setting("silu", "nonlinearity: relu, silu, tanh")
@@ -55,7 +55,7 @@ class BNN(_Network):
     """Bayesian neural network dynamics, or an ensemble of them."""
 
     kind: str = setting("bnn", "")
-    heteroscedastic: bool = setting(True, "predicted noise depends on the input")
+    heteroscedastic: bool = setting(True, "true: the predicted noise depends on the input; false: it is constant")
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class Lagrangian(_Network):
     kind: str = setting("lagrangian", "")
     hidden: tuple[int, ...] = setting((32, 32), "widths of the hidden layers")
     substeps: int | None = setting(
-        None, "Runge-Kutta steps a control period; null: 1 for up to two coordinates, 4 for more, which may be chaotic"
+        None, "Runge-Kutta steps in a control period; null: 1 for up to two coordinates, 4 for more"
     )
 
     def __post_init__(self) -> None:

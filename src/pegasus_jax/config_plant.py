@@ -16,14 +16,17 @@ VELOCITIES = ("none", "difference", "filter")
 class Explore:
     """The first episodes, before there is a model."""
 
-    trials: int = setting(1, "episodes of random controls")
-    kind: str = setting("uniform", "uniform: a fresh control each step; walk: a random walk")
+    trials: int = setting(1, "first episodes, with random controls")
+    kind: str = setting(
+        "uniform", "random controls: uniform, a new one in each period; walk, a random walk, which changes slowly"
+    )
     amplitude: float | None = setting(
-        None, "part of the control range that these grow to over an episode; null: all of it at once", EVERY
+        None, "part of the control range that random controls grow to over an episode; null: all of it at once", EVERY
     )
     policy: str | Callable | None = setting(  # noqa: RUF009 (frozen)
         None,
-        "module:function, observation -> controls, or a run's folder; with amplitude= random ones are added",
+        "controller of the first episodes: module:function, observation -> controls, or a run's folder;"
+        " explore.amplitude= adds random controls",
         EVERY,
     )
 
@@ -39,12 +42,12 @@ class Explore:
 class Sensors:
     """What a robot measures, and when; as `Config.sensors`."""
 
-    measured: tuple[int, ...] = setting((), "the entries of the observation that there are sensors for; []: all")
-    delay: int = setting(0, "control periods from a state until the policy sees it, or from a control until it acts")
+    measured: tuple[int, ...] = setting((), "the entries of the observation that the sensors measure; []: all")
+    delay: int = setting(0, "delay in control periods: of the sensors and of the controls together")
     velocity: str = setting(
-        "none", "the rates of what is measured are computed: by difference, or by filter, its low-pass; or none are"
+        "none", "how rates of the measured entries are computed: difference; filter, a low-pass of it; none, not at all"
     )
-    cutoff: float | None = setting(None, "of sensors.velocity=filter [Hz]; null: a fifth of the control rate")
+    cutoff: float | None = setting(None, "cutoff of sensors.velocity=filter [Hz]; null: a fifth of the control rate")
 
     def __post_init__(self) -> None:
         checks.typed("sensors", self)

@@ -18,7 +18,7 @@ class MLP:
     squash: str = setting("tanh", "saturation: tanh, or sine, (9 sin v + sin 3v)/8")
     input_units: tuple[float, ...] | None = setting(
         (),
-        "unit of each state that is no angle; []: the plant's, but for huge and tiny numbers; null: found in the data",
+        "what each entry that is not an angle is divided by; []: the plant's units; null: found in the data",
     )
     initializer: str = setting("glorot", "initial weights: glorot, orthogonal")
 
@@ -38,7 +38,7 @@ class RBF:
     """A controller of radial basis functions: the mean of a Gaussian process, PILCO's."""
 
     kind: str = setting("rbf", "")
-    num_centers: int = setting(30, "radial basis functions")
+    num_centers: int = setting(30, "number of radial basis functions")
     squash: str = setting("sine", "saturation: sine, (9 sin v + sin 3v)/8, or tanh")
 
     def __post_init__(self) -> None:

@@ -11,9 +11,9 @@ from pegasus_jax.cli import words as tables
 from pegasus_jax.cli.main import main
 
 COMPLETION = """\
-pegasus-completion bash|zsh|fish     print what makes a shell complete the words of the commands
+pegasus-completion bash|zsh|fish     print a script that makes your shell complete commands and settings
 
-Of bash and zsh, one line at the end of ~/.bashrc or ~/.zshrc; fish reads a folder:
+For bash or zsh, add one line at the end of ~/.bashrc or ~/.zshrc. For fish, write a file:
 
   eval "$(pegasus-completion bash)"
   eval "$(pegasus-completion zsh)"            after compinit

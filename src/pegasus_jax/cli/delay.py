@@ -10,20 +10,20 @@ from pegasus_jax.cli.words import MORE
 DELAY = """\
 pegasus-delay env=ID [amplitude=0.2] [periods=200] [setting=value ...]     measure the delay of a robot. It moves!
 
-Drives the environment by random controls, small ones, and says after how many control periods the first change is
-observed: of the motor's driver, the wires, the sensors and their filters together. Takes the words of pegasus-train
-besides; env_args.*, angles=, dt=, control_low= and control_high= are of use, and no cost is needed. Nothing is written.
-Before anything moves it says which controls it will send.
+Drives the environment with small random controls, and tells after how many control periods the observation changes.
+This is the delay of the motor's driver, the wires, the sensors and their filters together. Before anything moves it
+prints which controls it will send. It writes no file. It also takes settings of pegasus-train, such as env_args.*,
+angles=, dt=, control_low= and control_high=; it needs no cost.
 
-  amplitude=0.2         of the controls, as a fraction of half their range, above and below rest: 0, or the limit next
-                        to it. Each period has the one or the other. The range clips them: of [-1, 3] V amplitude=1
-                        sends -1 or 2 V. control_rate= makes them smaller. Too small, and no change is found
-  periods=200           control periods to drive, in several episodes if horizon= is less; each ends with one at rest.
-                        Where episodes end early others follow, for three times as many periods at most
-  most=8                the greatest delay that is looked for
+  amplitude=0.2         size of the controls, as a fraction of half their range. Each period has one above or one below
+                        rest, which is 0 or the limit next to it. The range clips them: of [-1, 3] V amplitude=1 sends
+                        -1 or 2 V. control_rate= makes them smaller. If they are too small, it finds no change
+  periods=200           control periods to drive, in several episodes if horizon= is less; each episode ends with a
+                        period at rest. If episodes end early, more follow, up to three times as many periods
+  most=8                the largest delay that it looks for
 
-A delay of 0 periods is the usual one of a simulation: a control changes what is read at the end of its own period.
-With sensors.delay=D pegasus-train learns with that delay.
+A simulation usually has a delay of 0 periods: a control changes the reading at the end of its own period. For a delay
+of D periods, train with sensors.delay=D.
 
 examples
   pegasus-delay env=robot:Arm-v0 angles=[0]

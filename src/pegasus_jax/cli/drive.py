@@ -8,19 +8,20 @@ from pegasus_jax.cli.runs import run_and, trial_of
 from pegasus_jax.cli.words import OF_RUN
 
 RUN = """\
-pegasus-run RUN [trial=best] [episodes=1] [seconds=...] [watchdog=...]     drive the environment of a run by its policy
+pegasus-run RUN [trial=best] [episodes=1] [seconds=...] [watchdog=...]     drive a run's environment with its policy
 
-The policy after trial=N, trial=last or the best trial is exported to NumPy, compared with itself, and drives the
-environment of a task=gym, which may be a robot, at its control period. Nothing is learned.
+Drives the environment of a task=gym, which may be a robot, at its control period. It exports the policy to NumPy first,
+and compares the file with the policy. trial= chooses the policy: best, last, or the number of a trial. Nothing is
+learned.
 
-  episodes=1            so many, each with a reset of the environment; seed=0 is given to the first
-  seconds=...           how long one takes (default: as long as those that the run learned from)
-  watchdog=...          close the environment where no control was sent for so many seconds (default: five periods, and
-                        at least 0.5): its step hangs, or the computer is too slow
+  episodes=1            number of episodes, each with a reset of the environment; the first gets seed=0
+  seconds=...           length of an episode (default: that of the run's own episodes)
+  watchdog=...          close the environment if no control is sent for so many seconds, because `step` hangs or the
+                        computer is too slow (default: five periods, and at least 0.5 s)
 
-Each episode leaves RUN/driven/NNNN.npz, with the arrays of the run's own episodes, `time` [s], when each control was
-sent, and `overruns`, how many of them were sent more than a tenth of a period late. Ctrl-C stops the motors: the
-environment is closed, and the rows so far are kept. With a `step` that does not wait, the command keeps the period.
+Each episode leaves RUN/driven/NNNN.npz. It has the arrays of the run's own episodes; `time` [s], when each control was
+sent; and `overruns`, the number of controls that were more than a tenth of a period late. Ctrl-C closes the
+environment, which stops the motors, and keeps the rows so far. If `step` does not wait, the command keeps the period.
 
 examples
   pegasus-run runs/gym-robot-Arm-v0-seed0

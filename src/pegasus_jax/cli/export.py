@@ -10,17 +10,17 @@ from pegasus_jax.cli.runs import run_and, trial_of
 from pegasus_jax.cli.words import OF_RUN
 
 EXPORT = """\
-pegasus-export RUN [trial=best] [format=numpy] [out=FILE] [overwrite=false]     a policy that runs anywhere
+pegasus-export RUN [trial=best] [format=numpy] [out=FILE] [overwrite=false]     write a policy to a file
 
-Writes the policy after trial=N, trial=last or the best trial as one file that needs neither this package nor JAX, and
-beside it FILE.json, its contract: names, units and order of observations and controls, limits, period, versions. The
-file's controls are compared with the policy's own on 1,000 observations, stored and random ones; a file that differs
-by more than 1e-5 of the control range is not kept.
+Writes the policy as one file that needs neither this package nor, except for stablehlo, JAX. trial= chooses the policy:
+best, last, or the number of a trial. Beside the file it writes FILE.json, the contract: names, units and order of
+observations and controls, limits, period, versions. It compares the file's controls with the policy's on 1,000
+observations, stored and random ones, and keeps no file that differs by more than 1e-5 of the control range.
 
   format=numpy          a Python module of plain NumPy with its weights inside (default: RUN/controller.py)
          c              a C99 header without allocation; a C compiler is needed to compare it (RUN/controller.h)
-         onnx           a graph for onnxruntime and others, of a batch of observations (RUN/controller.onnx)
-         stablehlo      a function for jax.export.deserialize, of any policy (RUN/controller.stablehlo)
+         onnx           a graph for onnxruntime and others; it takes a batch of observations (RUN/controller.onnx)
+         stablehlo      a function for jax.export.deserialize; it can hold any policy (RUN/controller.stablehlo)
 
 onnx needs the extra `export`: pip install 'pegasus-jax[export]'.
 

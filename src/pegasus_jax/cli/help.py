@@ -7,12 +7,14 @@ from pegasus_jax.checks import ConfigError
 
 TRAIN = """\
 pegasus-train task=NAME [setting=value ...]     learn a controller
-pegasus-train resume=RUN [trials=N ...]         go on with a run, also one that was killed
+pegasus-train resume=RUN [trials=N ...]         continue a run, also one that was killed
+
+These are the most common settings, with their defaults. --help=all shows all of them.
 
 {words}
 
---help=all shows every word, --version --verbose what a report of a problem needs. pegasus-check, with the same words,
-looks at a task and moves nothing. pegasus-completion makes a shell complete the words.
+pegasus-check with the same settings tests a task and moves nothing. pegasus-completion makes your shell complete the
+settings. Add the output of --version --verbose to a bug report.
 
 examples
   pegasus-train task=cartpole
@@ -22,21 +24,22 @@ examples
   pegasus-train task=mjcf mjcf=arm.xml cost=mymodule:cost dt=0.05 horizon=40
   pegasus-train resume=runs/demo trials=20
 
-Look at a run, finished or not, with pegasus-report RUN, pegasus-watch RUN, pegasus-plot RUN, pegasus-eval RUN or
-pegasus-play RUN; or with tensorboard --logdir RUN/tensorboard, after pip install tensorboard.
+To see a run, finished or not: pegasus-report RUN, pegasus-watch RUN, pegasus-plot RUN, pegasus-eval RUN, pegasus-play
+RUN. With TensorBoard: pip install tensorboard, then tensorboard --logdir RUN/tensorboard.
 """
 
 TRAIN_ALL = """\
 pegasus-train task=NAME [setting=value ...]     learn a controller
-pegasus-train resume=RUN [trials=N ...]         go on with a run
+pegasus-train resume=RUN [trials=N ...]         continue a run
 
-A preset is a value for each setting; model=, policy= and algorithm= change whole sections of it, and single settings
-come last. Shown is what they are with the words beside --help=all: pegasus-train task=gym algorithm=paper --help=all
+A task begins with a preset, which has a value for each setting. Then model=, policy= and algorithm= change whole
+sections of it, and single settings come last. The values below are those of task=cartpole. For the values of another
+command add its settings: pegasus-train task=gym algorithm=paper --help=all
 
 {words}
 
-PEGASUS_SETTINGS="fit.steps=5 search.steps=5" in the environment adds these words to every pegasus-train command,
-after those that are typed: of two values of a setting, the last one counts.
+The environment variable PEGASUS_SETTINGS="fit.steps=5 search.steps=5" adds these settings to every pegasus-train
+command, after those that you type. If a setting has two values, the last one counts.
 
 examples
   pegasus-train task=cartpole seeds=10
@@ -46,12 +49,12 @@ examples
 """
 
 CHECK = """\
-pegasus-check task=NAME [setting=value ...]     look at a task before it is learned
+pegasus-check task=NAME [setting=value ...]     test a task before you learn it
 
-Takes the words of pegasus-train, which looks first itself. Opens the environment, resets it once, drives nothing and
-closes it; without start_mean= it is reset more often, as pegasus-train does. Prints spaces, limits, control period,
-start and the cost there, and what its owner should know: a cost above 1, angles that look like degrees, readings that
-never change or follow from others. What cannot be learned is one line, and the exit status 2.
+Takes the settings of pegasus-train, which does the same test first. Opens the environment, resets it once, sends no
+control and closes it. Without start_mean= it resets more often, as pegasus-train does. Prints spaces, limits, control
+period, the start and the cost there. Notes tell what may be wrong: a cost above 1, angles that look like degrees,
+readings that never change or that repeat others. A task that cannot be learned gives one line and exit status 2.
 
 examples
   pegasus-check task=gym env=robot:Arm-v0 cost=robot:cost angles=[0] start_mean=[3.14,0]
@@ -61,30 +64,34 @@ examples
 EVALUATE = """\
 pegasus-eval RUN [trial=best] [episodes=20] [seed=0] [json=true]     run a learned policy on its plant
 
-Uses the policy after trial=N, trial=last or the best trial, and episodes that never become data. mjcf=FILE names the
-model's file where it was moved.
-Prints whose policy it is, mean cost per step and success rate (last five steps cost less than .2 on average). With
-json=true, one JSON object: in full, and with a fingerprint, the SHA-256 of data, model and policy, by which two runs
-can be told to be the same.
+Runs fresh episodes, which the run never learns from. trial= chooses the policy: best, last, or the number of a trial.
+mjcf=FILE gives the new place of a MuJoCo file that was moved.
+
+Prints the trial of the policy, its mean cost per step, and its success rate: the share of episodes whose last five
+steps cost less than the task's success= on average. json=true prints one JSON object with all numbers and a
+fingerprint, the SHA-256 of data, model and policy: two runs with the same fingerprint are equal.
 """
 
 PLOT = """\
-pegasus-plot RUN|FOLDER     draw a run, or those in a folder, finished or not
+pegasus-plot RUN|FOLDER     draw a run, or all runs in a folder, finished or not
 
-Writes RUN/plots/learning.png (cost and success against plant time) and RUN/plots/trial_NNNN.png for every trial:
-states, force and cost of the imagined particles after that trial, and over them what the plant did next.
-For a folder of runs, such as a sweep's, FOLDER/learning.png: those that differ in the seed alone have one color, every
-seed's raw curve thin, their interquartile mean thick with its 95 % bootstrap interval. pegasus-report shows more.
+Writes RUN/plots/learning.png, cost and success against plant time, and a RUN/plots/trial_NNNN.png for every trial:
+states, controls and cost of the imagined particles after that trial, and over them the next episode on the plant.
+
+For a folder of runs, such as a sweep's, writes FOLDER/learning.png. Runs that differ only in the seed have one color:
+a thin line for each seed, a thick one for their interquartile mean, and its 95 % bootstrap interval. pegasus-report
+shows more.
 """
 
 PLAY = """\
 pegasus-play RUN [trial=best] [episodes=1] [seed=0]     film a learned policy on its plant
 
-Drives the run's environment, which is opened with render_mode="rgb_array", or simulates its plant.
-Writes RUN/play.mp4: fresh episodes of the best policy, or that after trial=N or trial=last, in real time,
-20 pictures a second, with cost and command drawn below as they come about. Another seed= gives other starts and
-other noise. No display is needed: OpenGL comes from EGL or OSMesa, and MUJOCO_GL=egl|osmesa|glfw chooses; without
-a graphics card a picture takes a tenth of a second or two, so a minute for the swimmer's 20 s.
+Drives the run's environment, which it opens with render_mode="rgb_array", or simulates its plant. Writes RUN/play.mp4,
+in real time at 20 pictures a second, with the cost and the controls drawn below. trial= chooses the policy: best,
+last, or the number of a trial. Another seed= gives other starts and other noise.
+
+No display is needed: OpenGL comes from EGL or OSMesa, and MUJOCO_GL=egl|osmesa|glfw chooses. Without a graphics card
+a picture takes .1 to .2 s, so the 20 s of a swimmer take a minute.
 
 examples
   pegasus-play runs/cartpole-seed0

@@ -14,15 +14,16 @@ REPORT = """\
 pegasus-report RUN [out=RUN/report.html] [film=false] [csv=FOLDER]     a run as one HTML file
 pegasus-report FOLDER|RUN ... [out=FOLDER/report.html]                 several runs side by side
 
-Of a run, finished or not: warnings and what they mean, learning curves, calibration, each trial's real trajectory over
-the imagined ones, controls, the film of pegasus-play, the best policy, settings, versions. The file needs no network.
+The report of a run, finished or not, has warnings and what they mean, learning curves, calibration, each trial's real
+trajectory over the imagined ones, controls, the film of pegasus-play, the best policy, settings and versions. The file
+needs no network.
 
-Of a folder, such as a sweep's, the runs in it and in its folders: those that differ in the seed alone are a group, with
-interquartile means and their 95 % bootstrap intervals, and every seed's raw curve. Nothing is trained.
+The report of a folder, such as a sweep's, compares all runs in it. Runs that differ only in the seed are a group, with
+every seed's raw curve, the interquartile mean and its 95 % bootstrap interval. Nothing is trained.
 
-  out=FILE      where the page is written (of several runs without a folder for all: report.html)
-  film=true     film the best policy first, as pegasus-play RUN does; of one run
-  csv=FOLDER    write every curve there as CSV too; the page has them as links
+  out=FILE      the page (default for several runs that are named one by one: report.html)
+  film=true     film the best policy first, as pegasus-play RUN does; for one run only
+  csv=FOLDER    write every curve there as CSV too; the page links to them
 
 examples
   pegasus-report runs/cartpole-seed0

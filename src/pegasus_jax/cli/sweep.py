@@ -23,19 +23,19 @@ from pegasus_jax.shell import typed
 SWEEP = """\
 pegasus-sweep task=NAME [setting=value,value,... ...]     learn with every combination of the values
 
-A setting's values are separated by commas; A-B is every whole number from A to B. Commas inside brackets belong to a
-value: policy.hidden=[50,50],[200,200] are two. Every combination is a pegasus-train with its own folder,
-OUT/SETTING-VALUE_.../seedN, and is checked before the first one starts.
+Separate the values of a setting by commas; A-B is every whole number from A to B. Commas inside brackets belong to a
+value: policy.hidden=[50,50],[200,200] has two values. Every combination is a pegasus-train command with its own folder,
+OUT/SETTING-VALUE_.../seedN. All are checked before the first one starts.
 
   launcher=print        print the commands, one a line, and run none: for xargs, GNU parallel or any scheduler
            local        run them here, jobs= at a time
            slurm        hand them to SLURM as one job array, jobs= at a time, and return
-  jobs=2                how many run at once
-  out=runs/sweep        the folder of all runs; OUT/jobs has what local and slurm jobs printed
-  seeds=, mesh=, track=, final= of each pegasus-train; several trackers in brackets
+  jobs=2                number of jobs that run at once
+  out=runs/sweep        folder of all runs; OUT/jobs has what local and slurm jobs printed
+  seeds=, mesh=, track=, final=   as in pegasus-train, for each command; several trackers in brackets
   slurm.KEY=VALUE       any option of sbatch: slurm.partition=gpu slurm.time=120 slurm.gpus_per_node=1
 
-slurm needs the extra `sweep`: pip install 'pegasus-jax[sweep]'. All else is as in pegasus-train --help=all.
+slurm needs the extra `sweep`: pip install 'pegasus-jax[sweep]'. For the other settings see pegasus-train --help=all.
 
 examples
   pegasus-sweep task=cartpole search.grad_clip=1,10,100 seed=0-2

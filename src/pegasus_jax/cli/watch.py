@@ -11,8 +11,8 @@ from pegasus_jax.cli.words import OF_RUN
 WATCH = """\
 pegasus-watch RUN|FOLDER ... [port=8765]     the report of a run while it learns
 
-Serves the page of pegasus-report at http://127.0.0.1:8765, for this machine alone. A new trial appears by itself, and
-what is opened on the page stays open. Ctrl-C ends it; the run goes on. port=0 takes any port that is free.
+Serves the page of pegasus-report at http://127.0.0.1:8765, to this machine only. A new trial appears by itself, and
+what you opened on the page stays open. Ctrl-C ends the server; the run goes on. port=0 takes any port that is free.
 
 examples
   pegasus-watch runs/cartpole-seed0

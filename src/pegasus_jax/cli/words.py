@@ -16,51 +16,54 @@ from pegasus_jax.presets import ALGORITHMS, EFFORTS, MODELS, NETWORKS, POLICIES,
 
 # Words of pegasus-train that are no settings: as help shows them, and what they are for.
 OPTIONS = {
-    "out": ("out=runs/...", "the run's folder, or that of the runs of many seeds (default: runs/TASK-seedN)"),
+    "out": ("out=runs/...", "folder of the run; with seeds=, the folder of all runs (default: runs/TASK-seedN)"),
     "resume": (
         "resume=RUN",
-        "go on with a run, also one that was killed; trials=, eval_episodes=, fit.* and search.* may change",
+        "continue a run, also one that was killed; trials=, eval_episodes=, fit.* and search.* may change",
     ),
-    "final": ("final=true", "run the last policy for one more episode, which is data if the run goes on"),
+    "final": ("final=true", "run the last policy for one more episode; a continued run learns from it too"),
     "track": (
         "track=tensorboard",
-        "where numbers, settings and pictures also go: tensorboard, wandb, mlflow, several as wandb,mlflow, or none"
-        " (default: the numbers to tensorboard; of a run that goes on, where they went)",
+        "trackers that get numbers, settings and pictures: tensorboard, wandb, mlflow, several as wandb,mlflow, or none"
+        " (default: the numbers to tensorboard; a continued run keeps its trackers)",
     ),
-    "seeds": ("seeds=1", "so many seeds, from seed= on, as one program; each leaves its own run in OUT/seedN"),
+    "seeds": ("seeds=1", "number of seeds, from seed= on, that one program learns; each has its own run in OUT/seedN"),
     "mesh": (
         "mesh=SEEDSxPARTICLES",
-        "the devices that share seeds and particles (default: as many GPUs, or cores, as share the seeds evenly)",
+        "devices that share the seeds and the particles (default: as many GPUs, or cores, as divide the seeds)",
     ),
     "distributed": (
         "distributed=true",
-        "started on several hosts at once by SLURM or MPI: their devices act as one machine, and share OUT",
+        "use the devices of several hosts, on which SLURM or MPI started this command; they share OUT",
     ),
-    "coordinator": ("coordinator=HOST:PORT", "of hosts that neither SLURM nor MPI started, with the next two"),
-    "processes": ("processes=N", "so many hosts"),
-    "process": ("process=I", "which of them this one is, from 0"),
+    "coordinator": (
+        "coordinator=HOST:PORT",
+        "for hosts without SLURM or MPI: the first one's address; needs the next two settings",
+    ),
+    "processes": ("processes=N", "number of hosts"),
+    "process": ("process=I", "number of this host, from 0"),
 }
 NEW = ("out", "seeds")  # of these, those of a new run
 
 # Words that choose what a command begins with, or a whole section of it.
 _ALONE = [name for name in PRESETS if name not in NETWORKS]
 NAMED = {
-    "task": ("task=cartpole", f"what to learn: {', '.join(TASKS)}"),
+    "task": ("task=cartpole", f"plant and goal: {', '.join(TASKS)}"),
     "preset": (
         "preset=NAME",
-        f"begin with these settings instead of the task's own: {', '.join(_ALONE)}; or, with the paper's network,"
+        f"named settings to begin with, instead of the task's own: {', '.join(_ALONE)}; or, with the paper's network,"
         " cartpole_network, double_cartpole_network, swimmer_..._network",
     ),
     "model": (
         "model=NAME",
-        f"dynamics model: {', '.join(MODELS)} (default: the one that learns the task best; any other begins with"
-        " preset=TASK_network, whose settings do not depend on that one)",
+        f"dynamics model: {', '.join(MODELS)} (default: the best one for the task; any other begins with the settings"
+        " of preset=TASK_network)",
     ),
     "policy": ("policy=NAME", f"controller: {', '.join(POLICIES)}"),
-    "algorithm": ("algorithm=pegasus", f"how to search: {', '.join(ALGORITHMS)}"),
+    "algorithm": ("algorithm=pegasus", f"how the policy is searched: {', '.join(ALGORITHMS)}"),
     "effort": (
         "effort=laptop",
-        "how much a trial may compute: laptop; workstation, twice the search's iterations; gpu, four policies side by"
+        "computing time of a trial: laptop; workstation, twice the iterations of a search; gpu, four policies side by"
         " side",
     ),
 }
@@ -72,8 +75,8 @@ FIRST = (
 )
 # Who asks for a word: the first group that has it.
 GROUPS: dict[str, tuple[str, ...]] = {
-    "everybody": ("task", "preset", "effort", "out", "resume", "trials", "seed", "final", "eval_episodes", "track"),
-    "who has a robot, or an environment of Gymnasium": (
+    "every run": ("task", "preset", "effort", "out", "resume", "trials", "seed", "final", "eval_episodes", "track"),
+    "robots and Gymnasium environments": (
         *(
             "env",
             "env_args",
@@ -89,10 +92,10 @@ GROUPS: dict[str, tuple[str, ...]] = {
         ),
         *("sensors.*", "history", "explore.*", "data", "data_*"),
     ),
-    "who has a simulator, or learned in one": ("mjcf", "observe", "legs", "prior", "init", "init_parts"),
-    "who says what is to be reached": ("cost", "reference", "goal*", "success", "stop", "stop_cost", "constraint*"),
-    "who changes the method": ("model*", "policy*", "algorithm", "fit.*", "search.*", "successor", "x64"),
-    "who has many seeds, GPUs or hosts": ("seeds", "mesh", "distributed", "coordinator", "processes", "process"),
+    "simulators and earlier runs": ("mjcf", "observe", "legs", "prior", "init", "init_parts"),
+    "costs, goals and limits": ("cost", "reference", "goal*", "success", "stop", "stop_cost", "constraint*"),
+    "the method: model, policy and search": ("model*", "policy*", "algorithm", "fit.*", "search.*", "successor", "x64"),
+    "many seeds, GPUs or hosts": ("seeds", "mesh", "distributed", "coordinator", "processes", "process"),
 }
 
 # The values of words that have few.
