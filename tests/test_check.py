@@ -84,7 +84,7 @@ def test_it_says_what_a_robot_is_like_and_moves_nothing(tmp_path: Path) -> None:
     for part in ("OrderEnforcing of Arm", "u0 from -2 to 2", "5 periods of 0.05 s", "x0, x1", "more than 1: success"):
         assert part in said
     assert "begin with a cost 2.6 times as wide" in said
-    assert said.endswith("found  no error; the notes may matter\n")
+    assert said.endswith("result  no error; read the notes\n")
     assert [path.name for path in tmp_path.iterdir() if path.name not in ("robot.py", "__pycache__")] == ["asked.log"]
 
 
@@ -101,7 +101,7 @@ def test_the_cost_where_episodes_start_is_the_average_of_them(tmp_path: Path) ->
     wide = ["env=robot:Arm-v0", "cost=robot:cost", "start_mean=[0,0]", "start_std=[1.5]"]
     code, said, _ = call("check", *wide, cwd=tmp_path)
     assert code == 0, said
-    (told,) = (line.split()[2] for line in said.splitlines() if "cost there" in line)
+    (told,) = (line.split()[3] for line in said.splitlines() if "cost at start" in line)
     angles = np.random.default_rng(1).normal(0, 1.5, 100_000)
     assert float(told) == pytest.approx(np.mean(1 - np.exp(-2 * (1 - np.cos(angles)))), abs=0.08)
 

@@ -324,9 +324,7 @@ def test_a_trials_line_and_a_runs_last_one():
         {"constraint_broken": True, "constraint_rows": 0.01, "constraint_expected": 0.0, "ended": "horizon"},
     ]
     assert told(rows[:1]) == "constraint broken at 0% of the rows"
-    assert (
-        told(rows[1:2]) == "constraint broken at 12% of the rows, by the policy now in 3% of its episodes as imagined"
-    )
+    assert told(rows[1:2]) == "constraint broken at 12% of the rows, expected in 3% of the next policy's episodes"
     assert told([{}]) == limits_line([{"ended": "horizon"}]) == ""
     assert limits_line(rows) == "constraint broken in 2 of 3 episodes; 1 of these ended early"
 

@@ -61,7 +61,7 @@ def whole(place: Path) -> Path:
     done = subprocess.run(command("data=logs/*.csv", "out=whole"), cwd=place, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert f"note: logs of {17 * DT:g} s from 2 files are the first data" in done.stderr
-    assert "trial  1/3  0.0 s of plant  3 episodes of logs, 0.85 s: cost" in done.stderr
+    assert "trial  1/3 | 0.0 s of plant time | 3 episodes of logs, 0.85 s: cost" in done.stderr
     return place / "whole"
 
 
@@ -125,7 +125,7 @@ def test_logs_begin_a_run_whose_controller_remembers(place: Path, tmp_path: Path
     words = words_of("data=logs/*.csv", f"out={tmp_path / 'run'}", "trials=1", word, *PLAIN_WORDS)
     done = forked.command("train", *words, cwd=place)
     assert done.returncode == 0, done.stderr
-    assert "trial  1/1  0.0 s of plant  3 episodes of logs" in done.stderr
+    assert "trial  1/1 | 0.0 s of plant time | 3 episodes of logs" in done.stderr
 
 
 def test_bad_logs_end_the_command_before_a_folder_is_there(place: Path, tmp_path: Path, monkeypatch) -> None:

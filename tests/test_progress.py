@@ -45,38 +45,38 @@ UNMEASURED = {"mean_cost": None, "success_rate": None}
 
 def test_a_trial_in_one_line() -> None:
     assert summary([ROW], 15) == (
-        "trial  7/15  17.5 s of plant  episode by the policy of trial 6: cost 0.375, no success"
-        "  policy now: cost 0.310, success 85%, imagined cost 0.298"
-        "  model errors 1.3 times as large as predicted  (18.0 s until the next episode, 3.0 s of them compiling)"
+        "trial  7/15 | 17.5 s of plant time | episode by the policy of trial 6: cost 0.375, no success"
+        " | new policy: cost 0.310, success 85%, imagined cost 0.298"
+        " | model errors 1.3 times as large as predicted | 18.0 s until the next episode, 3.0 s of them compiling"
     )
 
 
 @pytest.mark.parametrize(
     ("changes", "says", "does_not_say"),
     [
-        (UNMEASURED, "cost 0.375, no success  policy now: imagined cost 0.298", "success 85%"),
-        ({"episode_success": True}, "cost 0.375, success  policy now", "no success"),
+        (UNMEASURED, "cost 0.375, no success | new policy: imagined cost 0.298", "success 85%"),
+        ({"episode_success": True}, "cost 0.375, success | new policy", "no success"),
         ({"ended": "interrupted", "steps": 17}, "cost 0.375, interrupted after 17 periods, no success", "horizon"),
         ({"policy": 4}, "by the policy of trial 4", "trial 6"),
         ({"policy": 0, "random": True}, "episode of random controls: cost 0.375", "by the policy"),
         (
             {**UNMEASURED, "objective_fresh": None, "calibration": None},
-            "cost 0.375, no success  (18.0 s until the next episode",
-            "policy now",
+            "cost 0.375, no success | 18.0 s until the next episode",
+            "new policy",
         ),
-        ({"replaced": False}, "policy kept: cost 0.310", "policy now"),
+        ({"replaced": False}, "policy kept: cost 0.310", "new policy"),
         ({"replaced": False, "policy": 3, "policy_next": 3}, "policy kept: cost 0.310", "policy of trial 3 again"),
         ({"replaced": False, "policy": 4, "policy_next": 3}, "policy of trial 3 again: cost 0.310", "policy kept"),
         ({"skipped_updates": 3}, "3 updates skipped", "None"),
         (
             {"seconds": {"compile": 5.0, "between_episodes": 1.5}},
-            "(1.5 s until the next episode, 1.5 s of them compiling)",
+            " | 1.5 s until the next episode, 1.5 s of them compiling",
             "5.0",
         ),
         (
             {"policy": 0, "random": True, "objective_fresh": None},
             "first policy, before any search: cost 0.310, success 85%",
-            "policy now",
+            "new policy",
         ),
     ],
 )
@@ -110,7 +110,7 @@ def test_a_policy_that_has_not_run_is_not_compared() -> None:
     own = ROW | {"mean_cost": None, "success_rate": None, "random": False, "episode_success": False}
     for trial, cost in enumerate((0.9, 0.7, 0.5, 0.6), 1):
         display.trial([own | {"trial": trial, "policy": trial - 1, "episode_cost": cost, "random": trial == 1}])
-    said = [line.partition("best so far: ")[2].split("  ")[0] for line in text.getvalue().splitlines()]
+    said = [line.partition("best so far: ")[2].split(" | ")[0] for line in text.getvalue().splitlines()]
     assert said == ["", "", "", "trial 2"]
 
 
@@ -134,7 +134,7 @@ def test_a_trial_that_is_still_evaluated_has_its_line_before_the_next(monkeypatc
         time.sleep(0.4)
         display.trial([ROW | {"trial": 1}])
         time.sleep(0.4)
-    assert [line.split("  ")[0].strip() for line in text.getvalue().splitlines()] == ["trial", "trial 2/3"]
+    assert [line[:9].strip() for line in text.getvalue().splitlines()] == ["trial  1/", "trial 2/3"]
 
 
 def test_a_first_controller_is_named() -> None:

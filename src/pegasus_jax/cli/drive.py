@@ -48,8 +48,8 @@ def handle(words: Sequence[str]) -> None:
             f"{done.log}: {len(done.times)} controls, mean cost {done.cost:.3f}, ended by {done.episode.ended};",
             end=" ",
         )
-        longest = f"the longest of {done.period:g} s took {done.longest:.4g} s"
-        print(f"{done.overruns} overruns, {longest}", flush=True)
+        longest = f"longest period {done.longest:.4g} s, planned {done.period:g} s"
+        print(f"overruns: {done.overruns}; {longest}", flush=True)
 
 
 def _seconds(name: str, text: str) -> float | None:

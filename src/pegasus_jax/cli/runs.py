@@ -22,7 +22,8 @@ def evaluate(words: Sequence[str]) -> None:
         print(json.dumps(result))
     else:
         print(chosen(run, trial, result["trial"]))
-        print(f"{episodes} episodes: mean cost {result['mean_cost']:.3f}, success {result['success_rate']:.0%}")
+        many = f"{episodes} episode{'s' * (episodes != 1)}"
+        print(f"{many}: mean cost {result['mean_cost']:.3f}, success {result['success_rate']:.0%}")
 
 
 def plot(words: Sequence[str]) -> None:

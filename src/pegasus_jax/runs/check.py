@@ -247,20 +247,20 @@ def report(config: Config) -> list[str]:
         "angles": ", ".join(task.state_names[i] for i in task.angles) or "none",
         "control": ", ".join(
             f"{name} from {low:g} to {high:g}"
-            + ("" if np.isinf(change) else f", by at most {change / task.dt:g} a second")
+            + ("" if np.isinf(change) else f", changing by at most {change / task.dt:g} in a second")
             for name, low, high, change in zip(
                 task.control_names, task.control_low, task.control_high, largest_change(task), strict=True
             )
         ),
         "time": f"{task.horizon} periods of {task.dt:g} s an episode, {task.horizon * task.dt:g} s"
         + ("; horizon= changes that" if asked.horizon is None and uses(asked.task, "horizon") else ""),
-        "start": f"{_numbers(task.start_mean)}, give or take {_numbers(task.start_std)}",
-        "cost there": f"{np.mean(begun):.4g} on average; below {task.success:g} is success"
+        "start": f"mean {_numbers(task.start_mean)}, standard deviation {_numbers(task.start_std)}",
+        "cost at start": f"{np.mean(begun):.4g} on average; below {task.success:g} is success"
         + (f"; searches begin with a cost {wide:.2g} times as wide" if wide > 1.05 else ""),
     }
-    verdict = "no error" + ("; the notes may matter" if notes else "")
-    lines = [*facts.items(), *(("note", note) for note in notes), ("found", verdict)]
-    return [f"{name:>12}  {value}" for name, value in lines]
+    verdict = "no error" + ("; read the notes" if notes else "")
+    lines = [*facts.items(), *(("note", note) for note in notes), ("result", verdict)]
+    return [f"{name:>17}  {value}" for name, value in lines]
 
 
 def understood(config: Config, task: Task) -> dict[str, str]:

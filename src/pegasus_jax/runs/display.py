@@ -247,7 +247,7 @@ def summary(
     errors = [row["calibration"] for row in rows if row["calibration"] is not None]
     parts = [
         f"trial {first['trial']:>2}/{trials}",
-        f"{first['plant_seconds']:.1f} s of plant",
+        f"{first['plant_seconds']:.1f} s of plant time",
         f"{executed(rows, exploring)}: cost {_mean(rows, 'episode_cost'):.3f}{outcome(rows)}",
         learned(rows),
         "" if best in (None, first["trial"], judged(first)) else f"best so far: trial {best}",
@@ -255,9 +255,9 @@ def summary(
         f"model errors {np.median(errors):.1f} times as large as predicted" if errors else "",
         skipped(rows),
         limits(rows),
-        f"({waited(first['seconds'])})",
+        waited(first["seconds"]),
     ]
-    return "  ".join(part for part in parts if part)
+    return " | ".join(part for part in parts if part)
 
 
 def judged(row: dict[str, Any]) -> int:
@@ -310,7 +310,7 @@ def which_policy(rows: Sequence[dict[str, Any]]) -> str:
     if all(row.get("policy") == 0 and row["objective_fresh"] is None for row in rows):
         return "first policy, before any search"
     if not all(row.get("replaced") is False for row in rows):
-        return "policy now"
+        return "new policy"
     back = rows[0].get("policy_next")
     return "policy kept" if len(rows) > 1 or back in (None, rows[0]["policy"]) else f"policy of trial {back} again"
 
@@ -327,7 +327,7 @@ def limits(rows: Sequence[dict[str, Any]]) -> str:
         return ""
     text = f"constraint broken at {_mean(rows, 'constraint_rows'):.0%} of the rows"
     expected = _mean(rows, "constraint_expected")
-    return text if expected is None else f"{text}, by the policy now in {expected:.0%} of its episodes as imagined"
+    return text if expected is None else f"{text}, expected in {expected:.0%} of the next policy's episodes"
 
 
 def limits_line(rows: Sequence[dict[str, Any]]) -> str:

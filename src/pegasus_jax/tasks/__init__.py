@@ -261,7 +261,7 @@ def described(config: Config) -> dict[str, str]:
     layers = [env]
     while hasattr(layers[-1], "env"):
         layers.append(layers[-1].env)
-    spaces = {"observes": env.observation_space, "is driven by": env.action_space}
+    spaces = {"observation space": env.observation_space, "action space": env.action_space}
     return {
         "environment": " of ".join(type(layer).__name__ for layer in layers),
         **{k: str(v) for k, v in spaces.items()},
