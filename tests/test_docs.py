@@ -267,7 +267,6 @@ def test_every_block_is_a_program_a_file_or_commands() -> None:
         "robot.c",
         "in_runtimes.py",
         "handed_on.py",
-        "export_both.py",
         "hand.py",
         "rows.py",
     }
