@@ -190,9 +190,9 @@ def test_readings_that_follow_from_others_are_named() -> None:
     (height,) = check.alike(np.column_stack([a, b, 0.5 * np.sin(a)]), angles=(0,))
     assert height.startswith("x2 follows from sin(x0) in")
     (still,) = check.alike(np.column_stack([a, np.full(20, 1e4), np.zeros(20)]))
-    assert "the same: x1, x2;" in still
+    assert "the same after each of 20 resets: x1, x2;" in still
     (many,) = check.alike(np.zeros((20, 78)))
-    assert "the same: x0, x1, x2, x3, x4, x5, x6, x7 and 70 more;" in many
+    assert "resets: x0, x1, x2, x3, x4, x5, x6, x7 and 70 more;" in many
 
 
 @pytest.mark.parametrize(
@@ -219,14 +219,14 @@ def test_where_episodes_end_is_looked_at_before_they_begin(stop: Any, says: str 
         (
             ("heading [rad]", "rate [rad/s]"),
             (),
-            ["heading [rad] is not among angles=; if it can turn around, angles=[0]"],
+            ["heading [rad] is not in angles=; if it can turn around, give angles=[0]"],
         ),
         (
             ("hip [rad]", "knee [rad]"),
             (),
-            ["hip [rad], knee [rad] are not among angles=; if they can turn around, angles=[0,1]"],
+            ["hip [rad], knee [rad] are not in angles=; if they can turn around, give angles=[0,1]"],
         ),
-        (("hip [rad]", "knee [rad]"), (1,), ["hip [rad] is not among angles=; if it can turn around, angles=[0,1]"]),
+        (("hip [rad]", "knee [rad]"), (1,), ["hip [rad] is not in angles=; if it can turn around, give angles=[0,1]"]),
         (("y [m]", "x1"), (0,), ["angles=[0]: y [m] is said to be an angle, and its unit is not rad"]),
         (("x0", "x1"), (0,), []),
     ],
@@ -248,7 +248,7 @@ def test_a_period_that_may_be_in_milliseconds_is_noted() -> None:
 @pytest.mark.parametrize(
     ("trials", "random", "told"),
     [
-        (1, 5, "; trials=6 or more, or explore.trials=1, changes that"),
+        (1, 5, "; give trials=6 or more, or explore.trials=1"),
         (2, 3, "trials=2 ends before the 3 random episodes of explore.trials=3 do: no policy will be learned"),
         (5, 5, ""),  # searched after the last one
         (1, 1, ""),

@@ -147,7 +147,7 @@ def test_what_will_be_sent_is_said(low: float, high: float, amplitude: float, ex
     """And is what is sent; the range clips it, and nothing has moved yet."""
     plan = planned(config(env="Motor-v0", **{"env_args.low": str(low), "env_args.high": str(high)}), amplitude, 100)
     line = announced(plan)
-    assert line.startswith(f"Motor-v0: sends voltage [V] of {expected}, by a new draw in each of 100 periods of 0.02 s")
+    assert line.startswith(f"Motor-v0: sends voltage [V] of {expected}, a new draw in each of 100 periods of 0.02 s")
     assert "\n" not in line
     assert Motor.sent == []
     measure(plan)
@@ -168,7 +168,7 @@ gymnasium.register("Steps-v0", Steps)
 
 def test_whole_numbers_are_said_as_they_are_sent() -> None:
     plan = planned(config(env="Steps-v0"), 0.7, 100)
-    assert announced(plan).startswith("Steps-v0: sends voltage [V] of -1 or 1, by a new draw")
+    assert announced(plan).startswith("Steps-v0: sends voltage [V] of -1 or 1, a new draw")
     measure(plan)
     assert {*Motor.sent} == {-1.0, 0.0, 1.0}
     with pytest.raises(ConfigError) as refused:

@@ -352,7 +352,7 @@ def test_nothing_of_a_user_is_replaced(run: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ([], "name one run, not 0"),
+        ([], "no run is named"),
         (["nowhere"], "nowhere is not a run"),
         (["RUN", "--film"], "'--film' is not an option here, key=value; did you mean 'film'"),
         (["RUN", "otu=a.html"], "otu is not an option here; did you mean 'out'"),

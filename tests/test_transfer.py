@@ -297,7 +297,7 @@ def test_a_model_of_a_number_that_nobody_said_begins_with_one_of_that_number(tmp
 
     for words in (null, number):
         assert "begins with the model of trial 1" in notes(words)[0]
-    with pytest.raises(ConfigError, match=r"has model.ensemble_size=1, and this run 2; model.ensemble_size=1"):
+    with pytest.raises(ConfigError, match=r"has model.ensemble_size=1, and this run 2; give model.ensemble_size=1"):
         notes(number | {"model.ensemble_size": "2"})
 
 
@@ -314,8 +314,8 @@ def said(words):
         (dict(init="RUN@first"), "names no trial: expected a number, best or last after @"),
         (dict(init="RUN@9"), "has no checkpoint of trial=9; choose from 1, 2, 3"),
         (dict(init="RUN", init_parts="[cost]"), "init_parts=cost is not a choice; choices: policy, model, data"),
-        (dict(init="RUN", policy__hidden="[4]"), "has policy.hidden=[3], and this run [4]; policy.hidden=[3]"),
-        (dict(init="RUN", policy="rbf"), "has policy.kind=mlp, and this run rbf; policy=mlp"),
+        (dict(init="RUN", policy__hidden="[4]"), "has policy.hidden=[3], and this run [4]; give policy.hidden=[3]"),
+        (dict(init="RUN", policy="rbf"), "has policy.kind=mlp, and this run rbf; give policy=mlp"),
         (dict(init="RUN", init_parts="[model]", model="log_normal"), "has model.kind=lagrangian, and this run bnn"),
         (dict(init="RUN", task="double_cartpole"), "is of cartpole with 4 states, and double_cartpole has 6"),
     ],
@@ -333,13 +333,13 @@ def test_a_beginning_that_does_not_suit_is_one_line(words, part, simulator):
     ("words", "part"),
     [
         (dict(init="nowhere"), "init=nowhere: nowhere is not a run"),
-        (dict(init="RUN", policy__hidden="[4]"), "has policy.hidden=[3], and this run [4]; policy.hidden=[3]"),
-        (dict(init="RUN", sensors__delay="1"), "before; that run has sensors.delay=0: say the same in both"),
+        (dict(init="RUN", policy__hidden="[4]"), "has policy.hidden=[3], and this run [4]; give policy.hidden=[3]"),
+        (dict(init="RUN", sensors__delay="1"), "before; that run has sensors.delay=0: give both runs the same"),
         (
             dict(init="RUN", control_rate="100", sensors__delay="1"),
-            "; that run has sensors.delay=0 and control_rate=[]: say the same in both",
+            "; that run has sensors.delay=0 and control_rate=[]: give both runs the same",
         ),
-        (dict(init="RUN", history="2", search__particles="12"), "; that run has history=1: say the same in both"),
+        (dict(init="RUN", history="2", search__particles="12"), "; that run has history=1: give both runs the same"),
         (dict(prior="nowhere.xml", model="log_normal"), "there is no such file"),
         (dict(prior="arm.xm", model="log_normal"), "prior=arm.xm is no simulator: expected module:function, as sim"),
         (dict(observe="[qpos.0]"), "observe=[qpos.0] is of an MJCF file: it needs task=mjcf, or prior=FILE.xml"),

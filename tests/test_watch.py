@@ -129,7 +129,7 @@ def test_a_run_without_a_trial_is_waited_for(run: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ([], "name one run, not 0"),
+        ([], "no run is named"),
         (["nowhere"], "nowhere is not a run"),
         (["RUN", "port=http"], "port=http is not a whole number; for example port=8765"),
         (["RUN", "port=70000"], r"port=70000 is out of range; expected a number in [0, 65535]; the nearest is 65535"),

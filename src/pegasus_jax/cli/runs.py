@@ -83,7 +83,7 @@ def paths_and(words: Sequence[str], defaults: dict[str, str]) -> tuple[list[Path
         word for word in words if "=" not in word or (word.partition("=")[0] not in defaults and Path(word).exists())
     ]
     if not named:
-        raise ConfigError("name one run, not 0; for example runs/cartpole-seed0")
+        raise ConfigError("no run is named; for example runs/cartpole-seed0")
     _, rest = config_io.split([word for word in words if word not in named])
     for key in rest:
         if key not in defaults:

@@ -65,7 +65,7 @@ def checked(config: Config, task: Task) -> list[str]:
     mine, its = (", ".join(seen_names(one)) for one in (task, theirs))
     if learned and seen_kinds(task) != seen_kinds(theirs):
         why = remembered(old, config) or (
-            "; say the same sensors., history= and control_rate= words in both runs, with a cost= of as many of u,"
+            "; give both runs the same sensors.*, history= and control_rate=, and a cost= that takes as many of u,"
             " previous_u, t, reference and goal"
         )
         raise ConfigError(f"{what} has a policy that sees {its}, and here it would see {mine}{why}")
@@ -75,10 +75,12 @@ def checked(config: Config, task: Task) -> list[str]:
         for name in its:
             if its[name] != mine.get(name):
                 hint = f"policy={its[name]}" if name == "policy.kind" else f"{name}={shown(its[name])}"
-                raise ConfigError(f"{what} has {name}={shown(its[name])}, and this run {shown(mine.get(name))}; {hint}")
+                raise ConfigError(
+                    f"{what} has {name}={shown(its[name])}, and this run {shown(mine.get(name))}; give {hint}"
+                )
     if "model" in config.init_parts and (old.prior is None) != (config.prior is None):
         raise ConfigError(
-            f"{what} has prior={shown(old.prior)}, and this run {shown(config.prior)}; init_parts=[policy]"
+            f"{what} has prior={shown(old.prior)}, and this run {shown(config.prior)}; give init_parts=[policy]"
         )
     parts = [f"the {' and '.join(learned)} of trial {trial}"] * bool(learned)
     parts += ["all episodes"] * begins_with(config, "data")
@@ -138,7 +140,7 @@ def remembered(old: Config, config: Config) -> str:
     for name in ("history", "control_rate", "goal_low", "goal_high", "goals", "reference"):
         its, mine = its | {name: getattr(old, name)}, mine | {name: getattr(config, name)}
     words = [f"{name}={shown(its[name])}" for name in its if shown(its[name]) != shown(mine[name])]
-    return f"; that run has {' and '.join(words)}: say the same in both" if words else ""
+    return f"; that run has {' and '.join(words)}: give both runs the same" if words else ""
 
 
 def copy(config: Config, run: Path) -> None:

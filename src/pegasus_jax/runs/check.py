@@ -91,7 +91,7 @@ def unlearned(config: Config) -> list[str]:
         return []
     return [
         f"trials={config.trials} ends before the {random} random episodes of explore.trials={random} do: no policy will"
-        f" be learned; trials={random + 1} or more, or explore.trials={config.trials}, changes that"
+        f" be learned; give trials={random + 1} or more, or explore.trials={config.trials}"
     ]
 
 
@@ -173,8 +173,8 @@ def turning(facts: cost_check.Facts, names: tuple[str, ...]) -> list[str]:
         which = some([names[i] for i in free])
         said = {places[i] for i in facts.angles} - {min(pair) for pair in facts.circles}
         angles = shown(sorted(said | {places[i] for i in free}))
-        if_so = "is not among angles=; if it can turn" if len(free) == 1 else "are not among angles=; if they can turn"
-        notes.append(f"{which} {if_so} around, angles={angles}")
+        if_so = "is not in angles=; if it can turn" if len(free) == 1 else "are not in angles=; if they can turn"
+        notes.append(f"{which} {if_so} around, give angles={angles}")
     wrong = [i for i in facts.angles if units[i] not in (None, "rad")]
     return notes + [f"angles=[{places[i]}]: {names[i]} is said to be an angle, and its unit is not rad" for i in wrong]
 
@@ -209,7 +209,7 @@ def alike(readings: np.ndarray, angles: tuple[int, ...] = (), names: tuple[str, 
     if still.any():
         same = some([names[i] for i in np.flatnonzero(still)])
         notes.append(
-            f"after each of {count} resets the same: {same}; right for a rate at rest, else a sensor may be dead"
+            f"the same after each of {count} resets: {same}; right for a rate at rest, else a sensor may be dead"
         )
     for i in range(size):
         earlier = {names[j]: readings[:, j] for j in range(i) if not still[j]}

@@ -147,8 +147,8 @@ def announced(plan: Plan) -> str:
         f"{name} of {a:.4g} or {b:.4g}" for name, a, b in zip(task.control_names, low, high, strict=True)
     )
     lines = [
-        f"{task.name}: sends {values}, by a new draw in each of {plan.periods} periods of {task.dt:g} s, or of up to"
-        f" {LONGER * plan.periods} where episodes end early"
+        f"{task.name}: sends {values}, a new draw in each of {plan.periods} periods of {task.dt:g} s, up to"
+        f" {LONGER * plan.periods} if episodes end early"
     ]
     if faster := _faster(plan):
         less = ", ".join(
