@@ -267,7 +267,7 @@ def test_a_run_that_ends_before_its_first_search_is_noted(trials: int, random: i
         ("seeds=0", "seeds=0 is out of range"),
         ("final=maybe", "final=maybe is"),
         ("mesh=4", "mesh=4 is not of the form SEEDSxPARTICLES"),
-        ("mesh=2x1", "mesh=2x1 cannot share 1 seeds evenly; mesh=1x1"),
+        ("mesh=2x1", "mesh=2x1 cannot share 1 seeds evenly; give mesh=1x1"),
         ("processes=2", "coordinator=HOST:PORT, processes=N and process=I"),
     ],
 )

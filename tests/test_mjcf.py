@@ -162,8 +162,8 @@ def test_folders_tell_tasks_apart() -> None:
         ),
         ({"control_low": (1.0, 2.0)}, "control_low has 2 entries; expected 1"),
         ({"control_low": (5.0,)}, "control_low=5 must be less than control_high=3"),
-        ({"control_low": (-4.0,)}, "actuator slide: controls from -4 to 3 are not among its own, from -3 to 3"),
-        ({"control_high": (3.5,)}, "actuator slide: controls from -3 to 3.5 are not among its own, from -3 to 3"),
+        ({"control_low": (-4.0,)}, "actuator slide: controls from -4 to 3 are beyond its limits, from -3 to 3"),
+        ({"control_high": (3.5,)}, "actuator slide: controls from -3 to 3.5 are beyond its limits, from -3 to 3"),
         ({"dt": 2000.0}, "dt=2000 is 100000 of its time steps; the most is dt=200"),
         ({"start_mean": (0.1,)}, "start_mean has 1 entries; expected 4"),
         ({"start_mean": (1.0, 2.0)}, "start_mean has 2 entries; expected 4"),
@@ -285,7 +285,7 @@ def test_limits_are_asked_for_where_the_file_has_none_and_one_list_is_as_long_as
     np.testing.assert_allclose((one.control_low, one.control_high), ([-0.5] * 2, [0.5] * 2))
     with pytest.raises(ConfigError, match="actuator pull has no ctrlrange"):
         tasks.of_config(config(path))
-    with pytest.raises(ConfigError, match="actuator spin: controls from -9 to 9 are not among its own, from -1 to 1"):
+    with pytest.raises(ConfigError, match="actuator spin: controls from -9 to 9 are beyond its limits, from -1 to 1"):
         tasks.of_config(config(path, control_low=(-9.0,), control_high=(9.0,)))
     prior = mjcf_plant.mechanism(mjcf_plant.read(path), 0.04, control_low=[-9.0], control_high=[9.0])  # has the task's
     np.testing.assert_allclose((prior.control_low, prior.control_high), ([-9] * 2, [9] * 2))

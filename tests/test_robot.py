@@ -201,7 +201,7 @@ def test_facts_that_are_given_are_not_asked_for() -> None:
     assert (known.dt, known.horizon) == (0.1, 100)
     with pytest.raises(ValueError, match="give control_low= and control_high="):
         env_spec("Bounds-v0", start_mean=[0, 0])
-    with pytest.raises(ValueError, match="controls from -2 to 2 are not among its own, from -1 to 1"):
+    with pytest.raises(ValueError, match="controls from -2 to 2 are beyond its limits, from -1 to 1"):
         env_spec("Bounds-v0", control_low=[-2], control_high=[2], start_mean=[0, 0])
     with pytest.raises(ValueError, match="start_mean has 3 entries; expected 2"):
         env_spec("Bounds-v0", control_low=[-1], control_high=[1], start_mean=[0, 0, 0])

@@ -228,7 +228,10 @@ def test_options_are_kept_from_the_settings():
 
 WRONG = [
     # not of the form
-    (["cartpole"], ["'cartpole' is not of the form key=value"]),
+    (["cartpole"], ["'cartpole' is not of the form key=value; did you mean 'task=cartpole'? --help=all"]),
+    (["cartpol"], ["'cartpol' is not of the form key=value; did you mean 'task=cartpole'?"]),
+    (["gp"], ["'gp' is not of the form key=value; did you mean 'model=gp'?"]),
+    (["--halp"], ["'--halp' is not of the form key=value; did you mean 'help'?"]),
     (["--trials"], ["'--trials' is not of the form key=value", "did you mean 'trials'?"]),
     (["=3"], ["'=3' is not of the form"]),
     # unknown variants

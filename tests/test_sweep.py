@@ -106,7 +106,7 @@ def beyond(x: Any) -> Any:
         (["search.particles=3,100"], "the nearest is search.particles=5"),
         (["search.grad_clip=1", "clipp=2"], "clipp is not a setting"),
         (["seeds=1,2"], "seeds=1,2 is not a whole number"),
-        (["seeds=4", "mesh=3x1"], "mesh=3x1 cannot share 4 seeds evenly; mesh=1x1"),
+        (["seeds=4", "mesh=3x1"], "mesh=3x1 cannot share 4 seeds evenly; give mesh=1x1"),
         (["mesh=1x1,4"], "mesh=4 is not of the form SEEDSxPARTICLES"),
         (["track=none,wanb"], "track=wanb is unknown; did you mean 'wandb'"),
         (["data=nowhere.csv", "seed=0-1"], r"data=nowhere\.csv: there is no such file"),

@@ -147,7 +147,7 @@ def env_spec(
             raise ValueError(f"controls from {least:g} to {greatest:g}: expected control_low below control_high")
         if not (bottom <= kind(least) and kind(greatest) <= top):
             raise ValueError(
-                f"controls from {least:g} to {greatest:g} are not among its own, from {bottom:g} to {top:g}"
+                f"controls from {least:g} to {greatest:g} are beyond its limits, from {bottom:g} to {top:g}"
             )
     size, rest = seen.shape[0], np.zeros(seen.shape)
     states = named(env, "state_names", state_names, size)

@@ -279,8 +279,8 @@ def within_range(model: mujoco.MjModel, low: np.ndarray, high: np.ndarray) -> No
     bottom, top = _ranges(model)
     for i in map(int, np.flatnonzero((low < bottom) | (high > top))):
         raise ValueError(
-            f"actuator {_control(model, i)}: controls from {low[i]:g} to {high[i]:g} are not among its"
-            f" own, from {bottom[i]:g} to {top[i]:g}"
+            f"actuator {_control(model, i)}: controls from {low[i]:g} to {high[i]:g} are beyond its"
+            f" limits, from {bottom[i]:g} to {top[i]:g}"
         )
 
 

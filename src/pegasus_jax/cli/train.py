@@ -122,5 +122,7 @@ def _shape(text: str, seeds: int) -> tuple[int, int]:
     if not (cross and first.isdecimal() and second.isdecimal() and int(first) and int(second)):
         raise ConfigError(f"mesh={text} is not of the form SEEDSxPARTICLES; for example mesh=4x1")
     if seeds % int(first):
-        raise ConfigError(f"mesh={text} cannot share {seeds} seeds evenly; mesh={math.gcd(seeds, int(first))}x{second}")
+        raise ConfigError(
+            f"mesh={text} cannot share {seeds} seeds evenly; give mesh={math.gcd(seeds, int(first))}x{second}"
+        )
     return int(first), int(second)

@@ -35,8 +35,12 @@ def split(words: Sequence[str], options: Sequence[str] = ()) -> tuple[dict[str, 
                 raise ConfigError(
                     f"'{word}' is not of the form key=value; write no spaces around =, as in task=cartpole"
                 )
-            choices = [*options, *NAMED, *leaves(Config())]
-            raise ConfigError(f"'{word}' is not of the form key=value; {_hint(word.lstrip('-'), choices)}")
+            placed = {
+                value: f"{name}={value}" for name in reversed(NAMED) for value in NAMED[name]
+            }  # task= before others
+            choices = [*options, *NAMED, *leaves(Config()), *placed.values(), "help"]
+            bare = word.lstrip("-")
+            raise ConfigError(f"'{word}' is not of the form key=value; {_hint(placed.get(bare, bare), choices)}")
         (known if key in options else rest)[key] = value
     return known, rest
 
