@@ -161,7 +161,7 @@ def _always() -> list[str]:
     try:
         return split(text)
     except ValueError as error:
-        raise ConfigError(f"PEGASUS_SETTINGS={text} cannot be read: {error}; expected key=value words") from error
+        raise ConfigError(f"PEGASUS_SETTINGS={text} cannot be read: {error}; expected settings, as trials=2") from error
 
 
 def _remember_compilations() -> None:

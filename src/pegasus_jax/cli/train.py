@@ -79,7 +79,7 @@ def check(words: Sequence[str]) -> None:
 
     options, _ = config_io.split(words, OPTIONS)
     if "resume" in options:
-        raise ConfigError(f"resume={options['resume']} was checked when it began; give the words of a new run")
+        raise ConfigError(f"resume={options['resume']} was checked when it began; give the settings of a new run")
     asked, _ = understood(words)
     from pegasus_jax.runs.check import report
 
