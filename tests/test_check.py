@@ -137,7 +137,7 @@ def test_training_notes_what_checking_does(tmp_path: Path) -> None:
         "has dt 0.05",
         "more than 1: success",
         "x2 follows from cos(x0)",
-        "the same: x3",
+        "resets: x3;",
         "trials=1 ends before",
     ):
         assert part in "\n".join(notes)

@@ -184,7 +184,7 @@ def test_a_limit_on_the_rate_of_change_is_said_and_how_to_lift_it() -> None:
         words = {"env": "Motor-v0", "env_args.low": str(low), "env_args.high": "5"}
         plan = planned(config(control_rate="10", **words), 0.8, 100)
         first, second = announced(plan).split("\n")
-        assert f"sends voltage [V] of {expected}, by" in first
+        assert f"sends voltage [V] of {expected}, a new draw" in first
         assert second == (
             f"note: control_rate=10 lets voltage [V] change by 0.2 a period, not {moves:g}, which amplitude=0.8 asks"
             f" for; type control_rate={moves / 0.02:g}, or leave it out"

@@ -158,7 +158,7 @@ def test_checks_and_errors_say_them(home: Path) -> None:
     assert "atan2(sin, cos), rate [rad/s]" in said
     assert "torque [N m] from -2 to 2" in said
     assert "cos and sin are cosine and sine of one angle" in said
-    assert "the same: rate [rad/s];" in said
+    assert "resets: rate [rad/s];" in said
     task = made(**{"env_args.breaks": "1"})
     task.environment.reset(0)
     with pytest.raises(ValueError, match=r"entry 2 of its observation, rate \[rad/s\], is nan"):
