@@ -66,7 +66,7 @@ def test_every_combination_has_its_own_run() -> None:
 
 
 def test_values_that_differ_in_signs_or_in_letters_alone_have_folders_of_their_own() -> None:
-    found = values("[1,0],[-1,0],[1,-0],1-0,[[1],[0]],x,X,a/b,+1,1,-1,1e-3,1e3," + "y" * 300 + "," + "y" * 301)
+    found = values("[1,0],[-1,0],[1,-0],1.0,[[1],[0]],x,X,a/b,+1,1,-1,1e-3,1e3," + "y" * 300 + "," + "y" * 301)
     names = [job.run.name for job in jobs_of({"start_mean": ",".join(found)}, Path("out"))]
     assert len({name.casefold() for name in names}) == len(found)
     assert names[:3] == ["start_mean-1-0", "start_mean--1-0", "start_mean-1--0"]
