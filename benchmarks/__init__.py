@@ -1,10 +1,11 @@
 """Measurements; benchmarks/README.md says what each command measures."""
 
+import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-from pegasus_jax.checks import ConfigError, RunError
+from pegasus_jax.checks import ConfigError, RunError, did_you_mean
 from pegasus_jax.cli import help
 
 RESULTS = Path(__file__).parent / "results"
@@ -13,16 +14,27 @@ RESULTS = Path(__file__).parent / "results"
 def command(main: Callable[[list[str]], int | None], what: str | None) -> None:
     """Run a benchmark with the words of its command line; `--help` prints `what`, the docstring of its module.
 
-    What cannot be run is one line and the exit status 1.
+    What cannot be run, and a file that cannot be read or written, is one line and the exit status 1; Ctrl-C is 130.
     """
-    words = sys.argv[1:]
+    words, name = sys.argv[1:], _name(Path(sys.argv[0]))
     try:
         if help.asked(words):
-            print(what)
+            print(what, flush=True)
             return
         status = main(words)
+        sys.stdout.flush()
     except (ConfigError, RunError) as error:
-        sys.exit(f"{_name(Path(sys.argv[0]))}: {error}")
+        sys.exit(f"{name}: {error}")
+    except BrokenPipeError:  # nobody reads it any more, as after `| head -1`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(1)
+    except OSError as error:
+        from pegasus_jax.runs.files import refused  # here: as in `only`
+
+        sys.exit(f"{name}: {refused(error)}")
+    except KeyboardInterrupt:
+        print(f"{name}: stopped", file=sys.stderr)
+        sys.exit(130)
     if status:
         sys.exit(status)
 
@@ -36,6 +48,61 @@ def named(words: list[str], what: str) -> tuple[str, list[str]]:
     if not words or "=" in words[0]:
         raise ConfigError(f"the first word is missing; expected {what}")
     return words[0], words[1:]
+
+
+def only(words: Sequence[str], names: Sequence[str]) -> dict[str, str]:
+    """The options of a command that takes no settings. Raises ConfigError for any other word."""
+    from pegasus_jax.runs import config_io  # here: what this module imports, every measured process waits for
+
+    options, others = config_io.split(words, names)
+    for name in others:
+        raise ConfigError(f"{name}= is unknown; {did_you_mean(name, names)}")
+    return options
+
+
+def none(words: Sequence[str]) -> None:
+    """Raises ConfigError where a command that takes no words is given one."""
+    if words:
+        raise ConfigError(f"{words[0]} is one word too many; expected none")
+
+
+def number(options: Mapping[str, str], name: str, default: int, least: int = 1) -> int:
+    """An option that is a whole number. Raises ConfigError for another, and for one below `least`."""
+    return _number(name, options.get(name, str(default)), default, least)
+
+
+def numbers(options: Mapping[str, str], name: str, default: str) -> list[int]:
+    """An option that is whole numbers from 1 on, with commas between them. Raises ConfigError for any other."""
+    return [_number(name, text, default, 1) for text in options.get(name, default).split(",")]
+
+
+def _number(name: str, text: str, example: object, least: int) -> int:
+    if not (text.isdecimal() and len(text) < 10 and int(text) >= least):
+        raise ConfigError(f"{name}={text} is not a whole number from {least} on; for example {name}={example}")
+    return int(text)
+
+
+def minutes(options: Mapping[str, str], default: float) -> float:
+    """The option of this name [min]. Raises ConfigError unless it is a number above 0."""
+    text = options.get("minutes", f"{default:g}")
+    try:
+        if 0 < (value := float(text)) < float("inf"):
+            return value
+    except ValueError:
+        pass
+    raise ConfigError(f"minutes={text} is not a number above 0; for example minutes={default:g}")
+
+
+def writable(out: str | Path) -> Path:
+    """The file of an option out=, in a folder that is there now. Raises ConfigError where no file can be written.
+
+    To be called before the work: what was measured for minutes is to find its place.
+    """
+    path = Path(out)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
+        raise ConfigError(f"out={out} cannot be written; expected the name of a file")
+    return path
 
 
 def once(*words: object) -> list[str]:

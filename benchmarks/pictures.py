@@ -24,14 +24,15 @@ import matplotlib.pyplot as plt
 import numpy as np
 from PIL import Image
 
-from benchmarks import command
+from benchmarks import command, only
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
 from pegasus_envs.plant import Plant
 from pegasus_envs.render import frames
 from pegasus_envs.swimmer.goals import Task
 from pegasus_envs.swimmer.plant import swimmer
-from pegasus_jax.runs import config_io, store
+from pegasus_jax.checks import ConfigError
+from pegasus_jax.runs import store
 from pegasus_jax.runs.restore import BEST, best, ready
 from pegasus_jax.viz import video
 
@@ -139,13 +140,14 @@ def of_run(name: str, run: Path) -> None:
 
 
 def main(words: list[str]) -> None:
-    """The command line of this module."""
+    """The command line of this module. Raises ConfigError for a word that it does not know, and for what is no run."""
+    options = only([] if words == ["plants"] else words, tuple(RUNS))
+    for name, run in options.items():
+        if not store.holds(Path(run)):
+            raise ConfigError(f"{name}={run} is not a run; pegasus-train {RUNS[name][0]} out={run} makes it")
     PICTURES.mkdir(parents=True, exist_ok=True)
     plants()
-    if words == ["plants"]:
-        return
-    options, _ = config_io.split(words, tuple(RUNS))
-    for name in RUNS:
+    for name in RUNS if words != ["plants"] else ():
         of_run(name, Path(options.get(name, f"runs/film-{name}")))
 
 

@@ -9,7 +9,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks import RESULTS, command, readme_table
+from benchmarks import RESULTS, command, none, readme_table
 from benchmarks.paper import claims
 from benchmarks.paper.comparison import draw, results
 from benchmarks.paper.figures import Figure, read
@@ -21,8 +21,9 @@ ORDER = ("cartpole", "crn", "clip", "rbf", "nn", "double")
 BEGIN, END = "<!-- generated: python -m benchmarks.results_page -->\n", "<!-- generated until here -->\n"
 
 
-def main(_: Sequence[str] = ()) -> None:
-    """Draw every figure that has studies, and write the generated part of both pages."""
+def main(words: Sequence[str] = ()) -> None:
+    """Draw every figure that has studies, and write the generated part of both pages. ConfigError for any word."""
+    none(words)
     for path in FIGURES.glob("*.toml"):
         figure = read(path)
         if there := results(figure, RESULTS):

@@ -13,6 +13,7 @@ a clone of github.com/merlresearch/MC-PILCO: see `of_mc_pilco`. The sizes must h
 
 import json
 import shlex
+import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -21,14 +22,22 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import torch
-from torch import Tensor
 
-from benchmarks import RESULTS, command
+try:
+    import torch
+    from torch import Tensor
+except ModuleNotFoundError:
+    if __name__ == "__main__":
+        sys.exit("compare: PyTorch is missing; pip install torch")
+    raise
+
+from benchmarks import RESULTS, command, number, writable
 from benchmarks.peers import of_mc_pilco, of_prob_mbrl, plain_torch
 from benchmarks.speed.timing import compiled, in_turn, own_products, summary
 from benchmarks.speed.workloads import SIZES, Workload, goal, workload
+from pegasus_jax.checks import choice
 from pegasus_jax.runs import config_io
+from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about
 
 STEPS, FIT_STEPS = 10, 100  # in one timed run
@@ -143,20 +152,21 @@ def main(words: list[str]) -> None:
     options, dotted = config_io.split(words, ("sizes", "repeats", "compile", "threads", "prob_mbrl", "mc_pilco", "out"))
     prob_mbrl = of_prob_mbrl.load(Path(options["prob_mbrl"])) if "prob_mbrl" in options else None
     mc_pilco = of_mc_pilco.load(Path(options["mc_pilco"])) if "mc_pilco" in options else None
-    torch.set_num_threads(int(options.get("threads", "1")))
+    torch.set_num_threads(number(options, "threads", 1))
     names = options["sizes"].split(",") if "sizes" in options else list(SIZES)
+    for name in names:
+        choice("sizes", name, SIZES)
+    repeats, out = number(options, "repeats", 5), writable(options.get("out", RESULTS / "peers.json"))
     rows = {}
     for name in names:
         work = workload({**SIZES[name], **dotted})
-        tuned, repeats = options.get("compile") == "true", int(options.get("repeats", "5"))
-        rows[name] = compare(work, repeats, tuned, prob_mbrl)
+        rows[name] = compare(work, repeats, options.get("compile") == "true", prob_mbrl)
         if mc_pilco is not None:
             work = of_mc_pilco.comparable({**SIZES[name], **of_mc_pilco.SETTINGS, **dotted})
             rows[name] |= beside_mc_pilco(mc_pilco, work, repeats)
         print(name, json.dumps({key: float(f"{value:.3g}") for key, value in rows[name].items()}), flush=True)
     command = shlex.join(["python", "-m", "benchmarks.peers.compare", *words])
-    result = {"rows": rows, "torch": torch.__version__, "about": about(command)}
-    Path(options.get("out", RESULTS / "peers.json")).write_text(json.dumps(result, indent=1) + "\n")
+    write_json(out, {"rows": rows, "torch": torch.__version__, "about": about(command)})
 
 
 if __name__ == "__main__":

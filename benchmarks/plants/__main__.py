@@ -7,8 +7,6 @@ to run one, 10 and 100 episodes as one program, by the clock and of CPU time, be
 Accuracy: 20 s under random controls, 8 seeds. Energy: 10 s without friction and force.
 """
 
-import json
-import shlex
 import time
 from collections.abc import Callable
 from typing import Any
@@ -19,7 +17,7 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from benchmarks import RESULTS, command
+from benchmarks import RESULTS, command, none
 from benchmarks.plants.in_c import Drive, held, in_c, stroke
 from pegasus_envs.cartpole import cartpole
 from pegasus_envs.double_cartpole import double_cartpole
@@ -27,6 +25,7 @@ from pegasus_envs.physics import Motion
 from pegasus_envs.plant import Plant, simulate
 from pegasus_envs.swimmer.plant import HIPS, swimmer
 from pegasus_envs.swimmer.rotations import angles_of
+from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about, cpus
 
 SECONDS, SEEDS, TIMES = 20.0, 8, (0.5, 1, 2, 3, 5, 10, 20)
@@ -163,16 +162,17 @@ def table(rows: dict[str, dict[str, Any]]) -> str:
 
 
 def main(words: list[str]) -> None:
-    """The command line of this module."""
+    """The command line of this module. Raises ConfigError for any word."""
+    none(words)
     cores = cpus()
     rows = {name: {"cost": cost(plant, drive(plant)), "strays": strays(plant, drive)}
             for name, (plant, drive) in PLANTS.items()}  # fmt: skip
     rows["cartpole"]["energy_drift"] = energy_drift(cartpole(friction=0.0))
     rows["double_cartpole"]["energy_drift"] = energy_drift(double_cartpole(friction=0.0))
     print(table(rows))
-    command = shlex.join(["python", "-m", "benchmarks.plants", *words])
+    command = "python -m benchmarks.plants"
     path = RESULTS / ("plants-one-core.json" if cores == 1 else "plants.json")
-    path.write_text(json.dumps({"cores": cores, "rows": rows, "about": about(command)}, indent=1) + "\n")
+    write_json(path, {"cores": cores, "rows": rows, "about": about(command)})
 
 
 if __name__ == "__main__":

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import command
+from benchmarks import command, number, only
 from benchmarks.plants.feedback import NAMES, ROLL, episodes
 from pegasus_envs.swimmer.plant import swimmer
-from pegasus_jax.runs import config_io
+from pegasus_jax.checks import choice
 
 CANDIDATES, ELITE, STARTS = 32, 8, 2
 GUESS = dict(zip(NAMES, (0.6, 0.3, 0.0, 0.5, 0.05, 0.2, 0.1, 0.5, 0.5, 0.4, 0.0), strict=True))
@@ -46,13 +46,13 @@ def search(task: str, legs: int, generations: int, seed: int) -> np.ndarray:
 
 
 def main(words: list[str]) -> None:
-    """The command line of this module."""
-    options, _ = config_io.split(words, ("legs", "task", "generations", "seed"))
-    task, legs = options.get("task", "knife_edge"), int(options.get("legs", "2"))
-    if task not in ROLL:
-        raise SystemExit(f"task={task} is none of {', '.join(ROLL)}")
-    generations = int(options.get("generations", "30" if task == "depth_change" else "9"))
-    print(np.round(search(task, legs, generations, int(options.get("seed", "0"))), 3).tolist())
+    """The command line of this module. Raises ConfigError for what it cannot use."""
+    options = only(words, ("legs", "task", "generations", "seed"))
+    task, legs = options.get("task", "knife_edge"), number(options, "legs", 2)
+    choice("task", task, ROLL)
+    choice("legs", legs, (2, 6))
+    generations = number(options, "generations", 30 if task == "depth_change" else 9)
+    print(np.round(search(task, legs, generations, number(options, "seed", 0, 0)), 3).tolist())
 
 
 if __name__ == "__main__":

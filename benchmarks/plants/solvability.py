@@ -6,7 +6,6 @@ Writes benchmarks/results/solvability.json and prints it beside the numbers of t
 swimmer's design (C MuJoCo, another hand-written law, its gains by CMA-ES, 16 starts).
 """
 
-import json
 import shlex
 from typing import Any
 
@@ -14,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import RESULTS, command
+from benchmarks import RESULTS, command, number, only
 from benchmarks.plants.feedback import GAINS, ROLL, episodes
 from pegasus_envs.swimmer.plant import swimmer
-from pegasus_jax.runs import config_io
+from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about
 
 COLUMNS = ("mean_square", "roll", "pitch", "yaw", "depth", "rate")
@@ -73,8 +72,7 @@ def line(name: str, values: Any) -> str:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
-    options, _ = config_io.split(words, ("starts",))
-    starts = int(options.get("starts", "16"))
+    starts = number(only(words, ("starts",)), "starts", 16)
     rows = {legs: solvability(legs, starts) for legs in (2, 6)}
     print(" " * 28 + "".join(f"{name:>13s}" for name in COLUMNS))
     for (legs, task), reported in STUDY.items():
@@ -84,9 +82,7 @@ def main(words: list[str]) -> None:
     command = shlex.join(["python", "-m", "benchmarks.plants.solvability", *words])
     result = {"starts": starts, "rows": {f"{task}, {legs} legs": rows[legs][task] for legs, task in STUDY}}
     study = {f"{task}, {legs} legs": dict(zip(COLUMNS, values, strict=False)) for (legs, task), values in STUDY.items()}
-    (RESULTS / "solvability.json").write_text(
-        json.dumps({**result, "design study": study, "about": about(command)}, indent=1) + "\n"
-    )
+    write_json(RESULTS / "solvability.json", {**result, "design study": study, "about": about(command)})
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import command
+from benchmarks import command, number
 from benchmarks.robot.cartpole_by_hand import exact
 from benchmarks.robot.sensors import CARTPOLE
 from pegasus_jax import episode, tasks
@@ -64,7 +64,7 @@ def main(given: list[str]) -> None:
     """The command line of this module. Raises ConfigError for what it cannot use."""
     options, words = config_io.split(given, ("delay", "seeds", "searches"))
     own = dict(word.split("=", 1) for word in CARTPOLE) | {"sensors.delay": options.get("delay", "1")}
-    seeds, searches = seed_list(options.get("seeds", "100-105")), int(options.get("searches", "4"))
+    seeds, searches = seed_list(options.get("seeds", "100-105")), number(options, "searches", 4)
     found = searched(config_io.parse(own | words), seeds, searches)
     below = [sum(row[i][0] < 0.5 for row in found) for i in range(searches)]
     print(f"cost below .5 after searches 1 to {searches}: {' '.join(map(str, below))} of {len(seeds)}")

@@ -15,10 +15,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks import command
+from benchmarks import command, none
 from pegasus_jax import preset, tasks
 from pegasus_jax.assembly.pieces import dynamics_of
-from pegasus_jax.checks import ConfigError
 from pegasus_jax.models.residual import residual
 from pegasus_jax.types import Dataset
 from pegasus_jax.vectorized import for_particles
@@ -73,8 +72,7 @@ def seconds(prior: Any, file: Path) -> tuple[float, float]:
 
 def main(words: Sequence[str] = ()) -> None:
     """Print the table. Raises ConfigError for any word."""
-    if words:
-        raise ConfigError(f"{words[0]} is one word too many; expected none")
+    none(words)
     with tempfile.TemporaryDirectory() as folder:
         files = {name: Path(folder) / f"{name}.xml" for name in ("free", "limited")}
         files["free"].write_text(LINK.format(limits=""))

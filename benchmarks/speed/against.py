@@ -29,6 +29,7 @@ import numpy as np
 
 DEFAULT = {"default": {"task": "cartpole"}}  # beside the sizes of workloads.py: what a first command learns with
 SIZES = "default,cart-pole,double cart-pole"
+OPTIONS = ("rounds", "steps", "processes", "core", "sizes", "out")
 COMMAND = ("python", "-m", "benchmarks.speed.against")
 STEPS = {"search": 10, "fit": 100}  # in one timed run
 Row = dict[str, Any]
@@ -215,28 +216,42 @@ def table(rows: dict[str, Row]) -> str:
 
 def main(words: list[str]) -> None:
     """The command line of this module."""
+    from benchmarks import number, only, writable  # here: serving, this file belongs to another checkout
+    from benchmarks.speed.workloads import SIZES as KNOWN
+    from pegasus_jax.checks import ConfigError, choice
+    from pegasus_jax.runs.files import write_json
+    from pegasus_jax.runs.machine import about
+
     folders = [Path(word).resolve() for word in words if "=" not in word]
     if len(folders) != 2:
-        sys.exit(f"name two checkouts, OLD and NEW, not {len(folders)}")
+        raise ConfigError(f"name two checkouts, OLD and NEW, not {len(folders)}")
+    for folder in folders:
+        if not (folder / "src" / "pegasus_jax").is_dir():
+            raise ConfigError(f"{folder} is not a checkout: it has no src/pegasus_jax")
     checkouts = folders[0], folders[1]
-    given = dict(word.split("=", 1) for word in words if "=" in word)
-    options = {"rounds": "4", "steps": "20", "processes": "5", "core": "0", "sizes": SIZES, "out": ""} | given
-    os.sched_setaffinity(0, {int(options["core"])})  # and of every process that it starts
+    given = only([word for word in words if "=" in word], OPTIONS)
+    rounds, steps = number(given, "rounds", 4), number(given, "steps", 20)
+    pairs, core = number(given, "processes", 5, 0), number(given, "core", 0, 0)
+    sizes = [size for size in given.get("sizes", SIZES).split(",") if size]
+    for size in sizes:
+        choice("sizes", size, DEFAULT | KNOWN)
+    choice("core", core, sorted(os.sched_getaffinity(0)))
+    os.sched_setaffinity(0, {core})  # and of every process that it starts
+    out = writable(given["out"]) if given.get("out") else None
     rows: dict[str, Row] = {}
-    from pegasus_jax.runs.machine import about  # here: serving, this file belongs to another checkout
 
     def keep(found: dict[str, Pair]) -> None:
         new = {name: judged(*pair) for name, pair in found.items()}
         rows.update(new)
         print(table(new), flush=True)
-        if options["out"]:
+        if out is not None:
             told = about(shlex.join([*COMMAND, "OLD", "NEW", *map("=".join, given.items())]))
-            Path(options["out"]).write_text(json.dumps({"rows": rows, "about": told}, indent=1) + "\n")
+            write_json(out, {"rows": rows, "about": told})
 
-    if int(options["processes"]):
-        keep(processes(checkouts, int(options["processes"])))
-    for size in options["sizes"].split(",") if options["sizes"] else ():
-        keep(living(checkouts, size, int(options["rounds"]), int(options["steps"])))
+    if pairs:
+        keep(processes(checkouts, pairs))
+    for size in sizes:
+        keep(living(checkouts, size, rounds, steps))
 
 
 if __name__ == "__main__":

@@ -7,20 +7,20 @@ included. Prints milliseconds and multiples of a (100 x 200)(200 x 200) product 
 benchmarks/results/combinations.json.
 """
 
-import json
 import shlex
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 
-from benchmarks import RESULTS, command
+from benchmarks import RESULTS, command, number
 from benchmarks.speed.growth import experience
 from benchmarks.speed.timing import compiled, in_turn, matmul
 from benchmarks.speed.workloads import ALIKE
 from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.presets import MODELS, POLICIES
 from pegasus_jax.runs import config_io
+from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about
 
 STEPS, PRODUCTS = 4, 500  # in one call
@@ -46,13 +46,14 @@ def step(words: dict[str, str], repeats: int) -> dict[str, float]:
 def main(words: list[str]) -> None:
     """The command line of this module; the file is written after every row."""
     options, dotted = config_io.split(words, ("repeats",))
+    repeats = number(options, "repeats", 5)
+    config_io.parse(COMBINATIONS[0] | dotted)  # what cannot be is said before the table begins
     result = {"rows": [], "about": about(shlex.join(["python", "-m", "benchmarks.speed.combinations", *words]))}
-    RESULTS.mkdir(exist_ok=True)
     print(f"{'model':15s}{'policy':14s}{'search':10s}{'ms':>9s}{'products':>10s}{'compile s':>11s}")
     for chosen in COMBINATIONS:
-        row = step(chosen | dotted, int(options.get("repeats", "5")))
+        row = step(chosen | dotted, repeats)
         result["rows"].append({**chosen, **row})
-        (RESULTS / "combinations.json").write_text(json.dumps(result, indent=1) + "\n")
+        write_json(RESULTS / "combinations.json", result)
         how = chosen.get("algorithm", "particles")
         numbers = f"{row['min_ms']:9.1f}{row['of_product']:10.0f}{row['compile_s']:11.1f}"
         print(f"{chosen['model']:15s}{chosen['policy']:14s}{how:10s}{numbers}", flush=True)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import RESULTS, command
+from pegasus_jax.checks import ConfigError
 
 STORED = RESULTS / "speed.json"
 LIMIT = 1.3
@@ -24,9 +25,20 @@ def ratios(new: Rows, stored: Rows) -> dict[str, float]:
     return {name: new[name]["of_matmul"] / stored[name]["of_matmul"] for name in shared}
 
 
+def read(path: str | Path) -> dict[str, Any]:
+    """A run of the suite. Raises ConfigError for another file."""
+    try:
+        run = json.loads(Path(path).read_text())
+        return {"rows": dict(run["rows"]), "about": dict(run["about"])}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} is not what python -m benchmarks.speed.suite writes") from error
+
+
 def main(words: list[str]) -> int:
-    """The command line of this module; the exit code."""
-    new, stored = (json.loads(Path(path).read_text()) for path in (words[0], (words[1:] or [STORED])[0]))
+    """The command line of this module; the exit code. Raises ConfigError for what it cannot use."""
+    if len(words) not in (1, 2):
+        raise ConfigError(f"name a run of the suite, and at most one to hold it against, not {len(words)} files")
+    new, stored = map(read, [*words, STORED][:2])
     here, there = (run["about"].get("processor") for run in (new, stored))
     if here and there and here != there:
         print(f"made on {here}, held against a run on {there}: their vectors and caches may differ too")

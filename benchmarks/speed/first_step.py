@@ -17,7 +17,8 @@ import tempfile
 import time
 from typing import Any
 
-from benchmarks import command
+from benchmarks import command, number
+from pegasus_jax.checks import ConfigError
 
 STARTED = "PEGASUS_STARTED"  # when the command was given [s since 1970]
 
@@ -54,9 +55,9 @@ def once(words: list[str], cache: str) -> dict[str, float]:
     child = [sys.executable, "-c", "from benchmarks.speed.first_step import watched; watched()"]
     with tempfile.TemporaryDirectory() as folder:
         environment = {**os.environ, "XDG_CACHE_HOME": cache, STARTED: str(time.time())}
-        done = subprocess.run(
-            [*child, *words, f"out={folder}/run"], env=environment, stdout=subprocess.PIPE, check=True
-        )
+        done = subprocess.run([*child, *words, f"out={folder}/run"], env=environment, capture_output=True, text=True)
+    if done.returncode:
+        raise ConfigError((done.stderr.splitlines() or ["pegasus-train failed without a message"])[-1])
     return json.loads(done.stdout)
 
 
@@ -64,12 +65,13 @@ def main(words: list[str]) -> None:
     """The command line of this module."""
     from benchmarks import RESULTS  # here: what this module imports, the measured process waits for
     from pegasus_jax.runs import config_io
+    from pegasus_jax.runs.files import write_json
     from pegasus_jax.runs.machine import about, cpus
 
     options, rest = config_io.split(words, ("repeats",))
     train = [f"{key}={value}" for key, value in ({"task": "cartpole"} | rest).items()]
     rows: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
-    for _ in range(int(options.get("repeats", "3"))):
+    for _ in range(number(options, "repeats", 3)):
         with tempfile.TemporaryDirectory() as cache:
             for name, runs in rows.items():
                 runs.append(once(train, cache))
@@ -77,8 +79,7 @@ def main(words: list[str]) -> None:
     result: dict[str, Any] = {name: min(runs, key=lambda run: run["total"]) for name, runs in rows.items()}
     result |= {"runs": rows, "cpus": cpus()}
     result["about"] = about(shlex.join(["python", "-m", "benchmarks.speed.first_step", *words]))
-    RESULTS.mkdir(exist_ok=True)
-    (RESULTS / "first_step.json").write_text(json.dumps(result, indent=1) + "\n")
+    write_json(RESULTS / "first_step.json", result)
 
 
 if __name__ == "__main__":

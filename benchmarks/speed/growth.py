@@ -10,7 +10,6 @@ with an RBF policy, in double precision; H = 25. Prints a table and writes bench
 that others use, pin it to one CPU (`taskset -c 0`): it then counts its own seconds only.
 """
 
-import json
 import shlex
 from functools import partial
 from typing import Any
@@ -18,12 +17,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from benchmarks import RESULTS, command
+from benchmarks import RESULTS, command, number, numbers
 from benchmarks.speed.timing import compiled, in_turn, matmul, summary
 from benchmarks.speed.workloads import ALIKE
 from pegasus_jax.assembly.experiments import build, set_precision
 from pegasus_jax.learn import data as dataset
 from pegasus_jax.runs import config_io
+from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about
 from pegasus_jax.types import Batch, Dataset, Trajectory
 
@@ -74,8 +74,8 @@ def costs(method: dict[str, str], rows: int, words: dict[str, str], repeats: int
 def main(words: list[str]) -> None:
     """The command line of this module."""
     options, dotted = config_io.split(words, ("rows", "repeats"))
-    sizes = [int(n) for n in options.get("rows", "50,100,200,400,800").split(",")]
-    repeats = int(options.get("repeats", "3"))
+    sizes, repeats = numbers(options, "rows", "50,100,200,400,800"), number(options, "repeats", 3)
+    config_io.parse(METHODS["log_normal"][0] | dotted)  # what cannot be is said before the table begins
     table: list[dict[str, Any]] = []
     print(
         f"{'method':12s}{'n':>6s}" + "".join(f"{name + ' ms':>14s}" for name in ("loss", "condition", "draw", "search"))
@@ -89,10 +89,8 @@ def main(words: list[str]) -> None:
     products = 500
     reference = summary(in_turn({"matmul": matmul(products)}, repeats)["matmul"], products)["min_ms"]
     print(f"matmul 100x200x200: {reference:.3f} ms")
-    RESULTS.mkdir(exist_ok=True)
     command = shlex.join(["python", "-m", "benchmarks.speed.growth", *words])
-    result = {"rows": table, "matmul_ms": reference, "about": about(command)}
-    (RESULTS / "growth.json").write_text(json.dumps(result, indent=1) + "\n")
+    write_json(RESULTS / "growth.json", {"rows": table, "matmul_ms": reference, "about": about(command)})
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ import statistics
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -26,14 +25,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from benchmarks import RESULTS, command, named
+from benchmarks import RESULTS, command, named, number, numbers, writable
 from benchmarks.speed.timing import summary
 from benchmarks.speed.workloads import ALIKE, workload
 from pegasus_jax import sharding
 from pegasus_jax.assembly.experiments import compose
-from pegasus_jax.checks import ConfigError, did_you_mean
+from pegasus_jax.checks import ConfigError, check_range, did_you_mean
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io, writers
+from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.job import first_states, opened
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import FAST_RUN, Jitted, compiler_options, over_seeds, shard
@@ -95,9 +95,9 @@ def of_seeds(options: dict[str, str], words: dict[str, str], report: Report) -> 
 def of_devices(options: dict[str, str], words: dict[str, str], report: Report) -> None:
     """A few trials of many seeds, on more and more devices."""
     config = config_io.parse({"task": "cartpole", "model": "log_normal", **ALIKE, "trials": "3", **words})
-    (seeds,) = numbers(options, "seeds", "100")
+    seeds = number(options, "seeds", 100)
     first = None
-    for count in sorted(numbers(options, "devices", "1,2,4")):
+    for count in sorted(device_counts(options, "1,2,4")):
         name = f"{count} devices"
         row = study(config, seeds, sharding.mesh(count, 1), partial(report, name))
         seconds = statistics.median(row["trial_s"][1:] or row["trial_s"])  # the first one warms devices up
@@ -111,9 +111,9 @@ def of_particles(options: dict[str, str], words: dict[str, str], report: Report)
     config = config_io.parse(words)
     small = workload({**words, "search.particles": "100"})  # nothing in a state depends on K
     states = jax.tree.map(lambda leaf: leaf[None], small.state)
-    (steps,), (repeats,) = numbers(options, "steps", "5"), numbers(options, "repeats", "5")
+    steps, repeats = number(options, "steps", 5), number(options, "repeats", 5)
     first = None
-    for count in numbers(options, "devices", "1,4"):
+    for count in device_counts(options, "1,4"):
         over = sharding.mesh(1, count)
         experiment = compose(config, small.task, mesh=over)
         layout = {} if over is None else {"out_shardings": sharding.over_seeds(over)}
@@ -145,9 +145,11 @@ def memory(jitted: Jitted) -> float:
     return round((known.temp_size_in_bytes + known.output_size_in_bytes) / 1e9, 3) if known else float("nan")
 
 
-def numbers(options: dict[str, str], name: str, default: str) -> list[int]:
-    """The whole numbers of an option."""
-    return [int(text) for text in options.get(name, default).split(",")]
+def device_counts(options: dict[str, str], default: str) -> list[int]:
+    """On how many devices. Raises ConfigError for more than there are."""
+    found = numbers(options, "devices", default)
+    check_range("devices", max(found), 1, jax.device_count())
+    return found
 
 
 PARTS = {"seeds": of_seeds, "devices": of_devices, "particles": of_particles}
@@ -159,8 +161,7 @@ def main(words: list[str]) -> None:
     if part not in PARTS:
         raise ConfigError(f"{part} is unknown; {did_you_mean(part, PARTS)}")
     options, dotted = config_io.split(rest, ("counts", "devices", "seeds", "steps", "repeats", "out"))
-    path = Path(options.get("out", RESULTS)) / f"scaling-{part}.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
+    path = writable(f"{options.get('out', RESULTS)}/scaling-{part}.json")
     result: dict[str, Any] = {
         "rows": {},
         "about": about(shlex.join(["python", "-m", "benchmarks.speed.scaling", *words])),
@@ -168,7 +169,7 @@ def main(words: list[str]) -> None:
 
     def report(name: str, row: Row) -> None:
         result["rows"][name] = row
-        path.write_text(json.dumps(result, indent=1) + "\n")
+        write_json(path, result)
         brief = {key: value for key, value in row.items() if key not in ("trial_s", "objective", "gradient_norm")}
         rounded = json.loads(json.dumps(brief), parse_float=lambda text: float(f"{float(text):.4g}"))
         print(f"{name}  after {len(row['trial_s'])} trials " if "trial_s" in row else name, rounded, flush=True)

@@ -7,24 +7,23 @@ run: machines are noisy. `of products` is the time of a search step over that of
 alone in the same process with the same shapes. On a process pinned to one CPU (taskset -c 0) times are CPU time.
 """
 
-import json
 import resource
 import shlex
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import RESULTS, command
+from benchmarks import RESULTS, command, number, writable
 from benchmarks.speed.timing import clock, compiled, in_turn, matmul, own_products, summary
 from benchmarks.speed.workloads import SIZES, Workload, flop, workload
 from pegasus_jax.assembly.experiments import build
 from pegasus_jax.config import Config
 from pegasus_jax.runs import config_io
+from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about, cpus
 
 STEPS, FIT_STEPS, PRODUCTS = 10, 100, 500  # steps, and products, in one timed run
@@ -163,16 +162,14 @@ def table(rows: dict[str, Row]) -> str:
 def main(words: list[str]) -> None:
     """The command line of this module."""
     options, dotted = config_io.split(words, ("repeats", "quick", "out"))
-    rows = suite(dotted, int(options.get("repeats", "7")), options.get("quick") == "true")
+    out = writable(options.get("out", RESULTS / "speed.json"))
+    rows = suite(dotted, number(options, "repeats", 7), options.get("quick") == "true")
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     print(table(rows))
     print(f"peak memory of the process {peak / 1e9:.2f} GB")
     machine = {"cpus": cpus()}
     command = shlex.join(["python", "-m", "benchmarks.speed.suite", *words])
-    result = {"rows": rows, "peak_memory_bytes": peak, "machine": machine, "about": about(command)}
-    out = Path(options.get("out", RESULTS / "speed.json"))
-    out.parent.mkdir(exist_ok=True)
-    out.write_text(json.dumps(result, indent=1) + "\n")
+    write_json(out, {"rows": rows, "peak_memory_bytes": peak, "machine": machine, "about": about(command)})
 
 
 if __name__ == "__main__":

@@ -24,19 +24,18 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks import RESULTS, command
+from benchmarks import RESULTS, command, number, only
 from benchmarks.peers.solve.attempt import PLANTS, PROGRAMS
 from benchmarks.peers.solve.shown import picture, table
 from benchmarks.plants_suite.__main__ import on_core
 from benchmarks.results_page import write
 from pegasus_jax.checks import ConfigError, did_you_mean
-from pegasus_jax.runs import config_io
 from pegasus_jax.runs.files import write_json
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.study import seed_list
 
 OPTIONS = ("plants", "programs", "seeds", "core", "limit", "python", "mc_pilco", "prob_mbrl", "out")
-NUMBERS = {"core": "1", "limit": "600"}
+NUMBERS = {"core": 1, "limit": 600}
 CHECKOUTS = {"mc_pilco": "policy_learning/MC_PILCO.py", "prob_mbrl": "prob_mbrl/algorithms/mc_pilco.py"}
 PAGE = Path(__file__).parents[3] / "docs" / "comparison.md"
 BEGIN = "<!-- generated: python -m benchmarks.peers.solve show -->\n"
@@ -51,19 +50,9 @@ def chosen(name: str, text: str | None, known: dict[str, Any]) -> list[str]:
     return names
 
 
-def whole(options: dict[str, str], name: str, default: str) -> int:
-    """A whole number of the command line. ConfigError for anything else."""
-    text = options.get(name, default)
-    if not text.isdecimal():
-        raise ConfigError(f"{name}={text} is not a whole number from 0 on; for example {name}={default}")
-    return int(text)
-
-
 def asked(words: list[str]) -> tuple[dict[str, str], list[tuple[str, int, str]]]:
     """(options, the runs as plant, seed, program). Raises ConfigError for what cannot be run."""
-    options, rest = config_io.split(words, OPTIONS)
-    for name in rest:
-        raise ConfigError(f"{name}= is unknown; {did_you_mean(name, OPTIONS)}")
+    options = only(words, OPTIONS)
     ready = {name: name in options for name in CHECKOUTS}
     programs = chosen("programs", options.get("programs"), PROGRAMS)
     if "programs" not in options:
@@ -72,7 +61,7 @@ def asked(words: list[str]) -> tuple[dict[str, str], list[tuple[str, int, str]]]
         if name in programs and not (Path(options.get(name, "")) / file).is_file():
             raise ConfigError(f"{name}={options.get(name, '')} is not a checkout of it: there is no {file}")
     for name, default in NUMBERS.items():
-        whole(options, name, default)
+        number(options, name, default, 0)
     seeds = seed_list(options.get("seeds", "0-2").strip("[]"))
     plants = chosen("plants", options.get("plants"), PLANTS)
     runs = [(plant, seed, program) for plant in plants for seed in seeds for program in programs]
@@ -81,7 +70,7 @@ def asked(words: list[str]) -> tuple[dict[str, str], list[tuple[str, int, str]]]
 
 def one(plant: str, seed: int, program: str, options: dict[str, str]) -> dict[str, Any]:
     """One run: its policies as they were judged, and the load of the machine when it began."""
-    core, limit = (whole(options, name, default) for name, default in NUMBERS.items())
+    core, limit = (number(options, name, default, 0) for name, default in NUMBERS.items())
     python = sys.executable if program == "pegasus_jax" else options.get("python", sys.executable)
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder:
