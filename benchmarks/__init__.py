@@ -1,14 +1,20 @@
 """Measurements; benchmarks/README.md says what each command measures."""
 
+import json
 import os
+import shlex
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
+from typing import Any, TypeVar
 
 from pegasus_jax.checks import ConfigError, RunError, did_you_mean
 from pegasus_jax.cli import help
 
 RESULTS = Path(__file__).parent / "results"
+T = TypeVar("T")
+Run = dict[str, Any]  # what is kept of one, in a file of results
 
 
 def command(main: Callable[[list[str]], int | None], what: str | None) -> None:
@@ -105,14 +111,63 @@ def writable(out: str | Path) -> Path:
     return path
 
 
+def unfinished(path: Path) -> Path:
+    """The file of a study that is to be learned. Raises ConfigError where one is that came to its end: it has `about`.
+
+    Hours of work are not replaced by the slip of a keyboard, nor is a file of something else.
+    """
+    if path.exists():
+        try:
+            ended = "about" in (study := json.loads(path.read_text(encoding="utf-8"))) or "seeds" not in study
+        except (ValueError, TypeError):
+            ended = True
+        if ended:
+            raise ConfigError(f"{path} is there; expected the name of a new file, or that you move this one away")
+    return writable(path)
+
+
 def once(*words: object) -> list[str]:
     """The words of a command, which takes each once: of those that are there twice the last."""
     return list({word.partition("=")[0]: word for word in map(str, words)}.values())
 
 
-def beside_runs(out: str) -> tuple[Path, Path]:
-    """(file of the results, folder of the runs that they are of). Raises ConfigError unless `out` ends in .json."""
+def beside_runs(out: str, words: Sequence[str]) -> tuple[Path, Path, list[Run]]:
+    """(file of the results, folder of the runs that they are of, the results that are there) of a command.
+
+    The folder remembers the settings of its runs, `words`: a run that goes on keeps them, so other ones need another
+    file. Raises ConfigError for those, for a name that does not end in .json, and for a file of something else.
+    """
     path = Path(out).absolute()
     if path.suffix != ".json":
         raise ConfigError(f"out={out} is a folder's name; expected that of a file: out={out}.json")
-    return path, path.with_suffix("")
+    home, there = path.with_suffix(""), stored_runs(path)
+    home.mkdir(parents=True, exist_ok=True)
+    made, now = home / "settings.txt", shlex.join(sorted(words))
+    if not made.exists():
+        made.write_text(now + "\n", encoding="utf-8")
+    elif (before := made.read_text(encoding="utf-8").strip()) != now:
+        raise ConfigError(f"out={out} has runs of other settings, {before or 'none'}; expected those, or another out=")
+    return path, home, there
+
+
+def stored_runs(path: Path) -> list[Run]:
+    """The runs that a file of results has, if it is there. Raises ConfigError for a file of something else."""
+    try:
+        return [*map(dict, json.loads(path.read_text(encoding="utf-8"))["runs"])]
+    except FileNotFoundError:
+        return []
+    except (ValueError, KeyError, TypeError):
+        raise ConfigError(
+            f"out={path} has no runs of this command; expected a new file, or one that it wrote"
+        ) from None
+
+
+def each(jobs: int, calls: Iterable[Callable[[], T]]) -> Iterator[T]:
+    """What the calls return, `jobs` of them at a time, each as soon as it is there. After Ctrl-C none is begun."""
+    with ThreadPoolExecutor(jobs) as pool:
+        try:
+            for job in as_completed([pool.submit(call) for call in calls]):
+                yield job.result()
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise

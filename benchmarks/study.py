@@ -3,11 +3,12 @@
     python -m benchmarks.study NAME seeds=0-9 task=cartpole trials=15 [setting=value ...]
 
 Writes benchmarks/results/NAME.json: per seed and trial the mean cost of 20 evaluation episodes and their success rate.
+A study that is finished is not written over.
 """
 
 import shlex
 
-from benchmarks import RESULTS, command, named
+from benchmarks import RESULTS, command, named, unfinished
 from pegasus_jax.runs import config_io
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import share_cpus
@@ -19,8 +20,7 @@ def main(words: list[str], module: str = "benchmarks.study") -> None:
     name, rest = named(words, "the name of the file that this writes, without .json")
     options, dotted = config_io.split(rest, ("seeds",))
     config = config_io.parse(dotted)
-    path = RESULTS / f"{name}.json"
-    RESULTS.mkdir(exist_ok=True)
+    path = unfinished(RESULTS / f"{name}.json")
     seeds = seed_list(options.get("seeds", "0-9"))
     share_cpus(len(seeds))
     result = study(config, seeds, path)

@@ -6,24 +6,26 @@
 Runs `pegasus-train` once for each plant and seed, `jobs` at a time with one core each, then judges the policy after
 every trial by the environment's own reward over at most `episodes` (native.py). Writes one JSON, again after each run,
 and prints one table. The runs are in OUT without .json: the same command goes on with those that were stopped, by hand
-or after `minutes`. Tuning seeds are 100 to 119; 200 and above are for a final judgment only. Other settings are for all
-plants alike. The pendubot and the acrobot need a checkout of their simulator (of_ai_olympics.py).
+or after `minutes`; other settings need another OUT. Tuning seeds are 100 to 119; 200 and above are for a final judgment
+only. Other settings are for all plants alike. The pendubot and the acrobot need a checkout of their simulator
+(of_ai_olympics.py).
 """
 
 import json
 import os
 import shlex
 import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from benchmarks import beside_runs, command, once
+from benchmarks import beside_runs, command, each, minutes, number, once
 from benchmarks.plants_suite.native import MOST
 from benchmarks.plants_suite.plants import PLANTS
 from pegasus_jax.checks import ConfigError, did_you_mean
@@ -53,10 +55,11 @@ def one(
     plant, run, core, began = PLANTS[name], (home / f"{name}-{seed}").absolute(), cores.get(), time.monotonic()
     new = [f"env={plant.env}", *plant.words, f"seed={seed}", f"trials={plant.trials}", "eval_episodes=0", f"out={run}"]
     task = [f"resume={run}"] if (run / "config.yaml").exists() else once("task=gym", *new, *words)
-    learned = on_core([*PROGRAM, *task], core, 60 * minutes)
     judge = [sys.executable, "-m", "benchmarks.plants_suite.native", str(run), plant.env, str(episodes)]
-    judged = on_core(judge, core, None)
-    cores.put(core)
+    try:
+        learned, judged = on_core([*PROGRAM, *task], core, 60 * minutes), on_core(judge, core, None)
+    finally:
+        cores.put(core)
     rows = json.loads(judged[0].splitlines()[-1]) if judged[1] is None else []
     seconds, error = round(time.monotonic() - began, 1), learned[1] or judged[1]
     print(f"{name} seed {seed}, {seconds:.0f} s: {[row['native'] for row in rows]} {error or ''}", flush=True)
@@ -83,6 +86,8 @@ def on_core(command: list[str], core: int | None, limit: float | None) -> tuple[
             process.terminate()
             said, failed = process.communicate()
     lines = [line for line in failed.splitlines() if line.strip("- ") and not line.startswith(JAX_NOTE)]
+    if process.returncode in (130, -signal.SIGINT):  # Ctrl-C went to it, too
+        raise KeyboardInterrupt
     return said, None if process.returncode == 0 else (lines or ["no message"])[-1]
 
 
@@ -112,20 +117,15 @@ def main(given: list[str]) -> None:
     seeds = seed_list(options.get("seeds", "100-109").strip("[]"))
     if wrong := [name for name in names if name not in PLANTS]:
         raise ConfigError(f"plants={wrong[0]} is unknown; {did_you_mean(wrong[0], PLANTS)}")
-    out, home = beside_runs(options.get("out", "runs/plants_suite.json"))
-    jobs, minutes = int(options.get("jobs", "2")), float(options.get("minutes", "60"))
-    episodes = int(options.get("episodes", MOST))
-    cores = core_queue(jobs)
+    jobs, limit, episodes = number(options, "jobs", 2), minutes(options, 60), number(options, "episodes", MOST)
+    words = [f"{key}={value}" for key, value in rest.items()]
+    out, home, there = beside_runs(options.get("out", "runs/plants_suite.json"), words)
     told = about(shlex.join(["python", "-m", "benchmarks.plants_suite", *given]))
-    home.mkdir(parents=True, exist_ok=True)
-    words, runs = [f"{key}={value}" for key, value in rest.items()], list[dict[str, Any]]()
-    with ThreadPoolExecutor(jobs) as pool:
-        same = (home, words, minutes, episodes, cores)
-        jobs_of = [pool.submit(one, name, seed, *same) for seed in seeds for name in names]
-        for job in as_completed(jobs_of):
-            runs.append(job.result())
-            write_json(out, {"runs": runs, "about": told})
-    print(table(runs))
+    same, runs = (home, words, limit, episodes, core_queue(jobs)), {(run["plant"], run["seed"]): run for run in there}
+    for run in each(jobs, [partial(one, name, seed, *same) for seed in seeds for name in names]):
+        runs[run["plant"], run["seed"]] = run
+        write_json(out, {"runs": [*runs.values()], "about": told})
+    print(table([*runs.values()]))
 
 
 if __name__ == "__main__":

@@ -8,14 +8,15 @@ all of them.
 """
 
 import json
-import sys
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 
+from benchmarks import command, number
 from pegasus_jax import controller
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.runs import checkpoint, config_io, store
 
 FIRST_RESET, STEPS = 10_000, 10_000  # STEPS: after which there are enough episodes
@@ -53,5 +54,13 @@ def scores(run: Path, name: str, most: int = MOST) -> list[dict[str, Any]]:
     return rows
 
 
+def main(words: list[str]) -> None:
+    """The command line of this module. Raises ConfigError for what it cannot use."""
+    if len(words) not in (2, 3):
+        raise ConfigError(f"name a run and an environment, and at most how many episodes, not {len(words)} words")
+    most = number(dict(zip(["episodes"], words[2:], strict=False)), "episodes", MOST)
+    print(json.dumps(scores(Path(words[0]), words[1], most)))
+
+
 if __name__ == "__main__":
-    print(json.dumps(scores(Path(sys.argv[1]), sys.argv[2], *map(int, sys.argv[3:]))))
+    command(main, __doc__)

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import command, named
+from benchmarks import command, named, unfinished
 from benchmarks.robot import asked
 from pegasus_jax import sharding
 from pegasus_jax.checks import ConfigError, did_you_mean
@@ -124,6 +124,15 @@ def run(name: str, config: Config, seeds: list[int], out: Path, told: dict[str, 
     return result
 
 
+def stored(path: Path) -> dict[str, Any]:
+    """What a file has. Raises ConfigError for one that is not of this command."""
+    try:
+        result = json.loads(path.read_text())
+        return {**result, "seconds": result["seconds"], "task": result["task"]}
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} is not what python -m benchmarks.robot.costs writes") from error
+
+
 def table(result: dict[str, Any]) -> str:
     """One line a seed: the first trial at 90 %, then trial by trial success, and the last measures."""
     measures = [what for what in ("total_variation", "rms_error", "last_error") if what in result]
@@ -145,17 +154,18 @@ def main(words: list[str]) -> None:
     """The command line of this module; `show FILE.json ...` prints the tables again."""
     name, rest = named(words, f"one of {', '.join(TASKS)}")
     if name == "show":
-        print("\n".join(table(json.loads(Path(file).read_text())) for file in rest))
+        print("\n".join(table(stored(Path(file))) for file in rest))
         return
     if name not in TASKS:
         raise ConfigError(f"{name} is unknown; {did_you_mean(name, TASKS)}")
     options, settings = config_io.split(rest, ("seeds", "out"))
     _, own = config_io.split(TASKS[name])
     seeds = seed_list(options.get("seeds", "100-109"))
+    out = unfinished(Path(options.get("out", f"runs/costs-{name}.json")))
     share_cpus(len(seeds))
     config = config_io.parse(own | {"eval_episodes": str(EPISODES)} | settings)
     told = about(shlex.join(["python", "-m", "benchmarks.robot.costs", *words]))
-    print(table(run(name, config, seeds, Path(options.get("out", f"runs/costs-{name}.json")), told)), flush=True)
+    print(table(run(name, config, seeds, out, told)), flush=True)
 
 
 if __name__ == "__main__":

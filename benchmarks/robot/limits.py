@@ -10,19 +10,18 @@ Tuning seeds are 100 to 119; 200 and above are for a final judgment only.
 """
 
 import json
-import os
 import shlex
 import sys
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import beside_runs, command, once
-from benchmarks.plants_suite.__main__ import ONE_CORE, core_queue, on_core
-from pegasus_jax.checks import ConfigError
+from benchmarks import beside_runs, command, each, minutes, number, once
+from benchmarks.plants_suite.__main__ import core_queue, on_core
+from benchmarks.robot import seeds
 from pegasus_jax.cli.sweep import PROGRAM
 from pegasus_jax.runs import checkpoint, config_io, store
 from pegasus_jax.runs.files import write_json
@@ -98,9 +97,11 @@ def one(seed: int, home: Path, words: list[str], minutes: float, cores: Any) -> 
     ]
     new = once("task=gym", f"env={ENV}", *own, *WORDS.split(), *words, f"seed={seed}", f"out={run}")
     task = [f"resume={run}"] if (run / "config.yaml").exists() else new
-    learned = on_core([*PROGRAM, *task], core, 60 * minutes)
-    told = on_core([sys.executable, "-m", module, f"judge={run}"], core, None)
-    cores.put(core)
+    try:
+        learned = on_core([*PROGRAM, *task], core, 60 * minutes)
+        told = on_core([sys.executable, "-m", module, f"judge={run}"], core, None)
+    finally:
+        cores.put(core)
     rows = json.loads(told[0].splitlines()[-1]) if told[1] is None else []
     print(line(found := {"seed": seed, "error": learned[1] or told[1], "trials": rows}), flush=True)
     return found
@@ -133,19 +134,15 @@ def main(given: list[str]) -> None:
     if "judge" in options:
         print(json.dumps(judged(Path(options["judge"]))))
         return
-    if "furuta" not in options:
-        raise ConfigError("furuta= is missing: the folder of robot.py; for example furuta=shared/furuta")
-    ONE_CORE["PYTHONPATH"] = os.pathsep.join([options["furuta"], ONE_CORE["PYTHONPATH"]])
-    seeds, jobs = seed_list(options.get("seeds", "100-109")), int(options.get("jobs", "2"))
-    (out, home), minutes = beside_runs(options.get("out", "runs/limits.json")), float(options.get("minutes", "9"))
+    seeds.robot(options)
+    chosen, jobs, limit = seed_list(options.get("seeds", "100-109")), number(options, "jobs", 2), minutes(options, 9)
+    words = [f"{key}={value}" for key, value in rest.items()]
+    out, home, runs = beside_runs(options.get("out", "runs/limits.json"), words)
+    told, same = about(shlex.join(["python", "-m", "benchmarks.robot.limits", *given])), (home, words, limit)
     cores = core_queue(jobs)
-    told = about(shlex.join(["python", "-m", "benchmarks.robot.limits", *given]))
-    home.mkdir(parents=True, exist_ok=True)
-    words, runs = [f"{key}={value}" for key, value in rest.items()], list[dict[str, Any]]()
-    with ThreadPoolExecutor(jobs) as pool:
-        for job in as_completed([pool.submit(one, seed, home, words, minutes, cores) for seed in seeds]):
-            runs = sorted([*runs, job.result()], key=lambda run: run["seed"])
-            write_json(out, {"runs": runs, "about": told})
+    for run in each(jobs, [partial(one, seed, *same, cores) for seed in chosen]):
+        runs = seeds.with_run(runs, run)
+        write_json(out, {"runs": runs, "about": told})
     print("\n".join([*map(line, runs), f"{sum(verdict(run)[2] for run in runs)} of {len(runs)} at the bar"]))
 
 

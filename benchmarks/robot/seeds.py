@@ -7,11 +7,11 @@ import json
 import os
 import time
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from benchmarks import beside_runs, once
+from benchmarks import Run, beside_runs, each, minutes, number, once
 from benchmarks.plants_suite.__main__ import ONE_CORE, core_queue, on_core
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.cli.sweep import PROGRAM
@@ -28,7 +28,9 @@ KEPT = (
 
 def robot(options: dict[str, str]) -> Path:
     """The folder of robot.py, from which every run imports. Raises ConfigError where there is none."""
-    folder = Path(options.get("furuta", ".")).absolute()
+    if "furuta" not in options:
+        raise ConfigError("furuta= is missing: the folder of robot.py; for example furuta=shared/furuta")
+    folder = Path(options["furuta"]).absolute()
     if not (folder / "robot.py").is_file():
         raise ConfigError(f"furuta={folder} has no robot.py")
     ONE_CORE["PYTHONPATH"] += os.pathsep + str(folder)
@@ -37,18 +39,21 @@ def robot(options: dict[str, str]) -> Path:
 
 def learned(options: dict[str, str], words: Sequence[str], command: str) -> list[dict[str, Any]]:
     """The runs of all seeds with what is kept of their trials, written to `out` after each of them."""
-    until = time.monotonic() + 60 * float(options.get("minutes", "9"))
-    (out, home), told = beside_runs(options["out"]), about(command)
-    cores = core_queue(jobs := int(options.get("jobs", "2")))
-    home.mkdir(parents=True, exist_ok=True)
-    runs: list[dict[str, Any]] = []
-    words = once(*words, f"trials={options['trials']}")
-    with ThreadPoolExecutor(jobs) as pool:
-        seeds = seed_list(options.get("seeds", "100-109"))
-        for job in as_completed([pool.submit(one, home / f"seed{s}", words, s, until, cores) for s in seeds]):
-            runs = sorted([*runs, job.result()], key=lambda run: run["seed"])
-            write_json(out, {"runs": runs, "words": words, "about": told})
+    until = time.monotonic() + 60 * minutes(options, 9)
+    seeds, jobs = seed_list(options.get("seeds", "100-109")), number(options, "jobs", 2)
+    trials = f"trials={number(options, 'trials', 10)}"
+    settings = [word for word in once(*words) if not word.startswith("trials=")]  # a run may go on for more trials
+    (out, home, runs), told = beside_runs(options["out"], settings), about(command)
+    words, cores = [*settings, trials], core_queue(jobs)
+    for run in each(jobs, [partial(one, home / f"seed{s}", words, s, until, cores) for s in seeds]):
+        runs = with_run(runs, run)
+        write_json(out, {"runs": runs, "words": words, "about": told})
     return runs
+
+
+def with_run(runs: Sequence[Run], run: Run) -> list[Run]:
+    """The runs by their seeds, with a new one, which replaces that of its seed."""
+    return sorted([*(old for old in runs if old["seed"] != run["seed"]), run], key=lambda run: run["seed"])
 
 
 def one(run: Path, words: Sequence[str], seed: int, until: float, cores: Any) -> dict[str, Any]:

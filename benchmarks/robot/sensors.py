@@ -17,7 +17,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from benchmarks import command
+from benchmarks import command, unfinished
 from benchmarks.robot import seeds
 from pegasus_jax.checks import ConfigError, choice
 from pegasus_jax.runs import config_io
@@ -41,7 +41,7 @@ CARTPOLE = (
 def cartpole(options: dict[str, str], words: Sequence[str], command: str) -> None:
     """Every seed in one program; its curves are written after each trial."""
     config = config_io.parse(dict(word.split("=", 1) for word in [*CARTPOLE, *words]))
-    numbers, out = seed_list(options.get("seeds", "100-109")), Path(options["out"])
+    numbers, out = seed_list(options.get("seeds", "100-109")), unfinished(Path(options["out"]))
     share_cpus(len(numbers))
     result = study(config, numbers, out)
     write(out, result | {"about": about(command)})
@@ -81,7 +81,6 @@ def main(given: list[str]) -> None:
         words = [f"sensors.delay={options.get('delay', {'cartpole': '0', 'furuta': '1'}[kind])}", *words]
     if kind == "cartpole":
         words.append(f"trials={options.get('trials', '10')}")
-    Path(options["out"]).parent.mkdir(parents=True, exist_ok=True)
     KINDS[kind](options, words, shlex.join(["python", "-m", "benchmarks.robot.sensors", *given]))
 
 

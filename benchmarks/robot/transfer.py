@@ -22,7 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import command
+from benchmarks import command, number
 from benchmarks.robot import cartpole_by_hand
 from pegasus_jax import sharding
 from pegasus_jax.checks import ConfigError
@@ -30,7 +30,7 @@ from pegasus_jax.config import Config
 from pegasus_jax.experiment import EVALUATE, trial_key
 from pegasus_jax.runs import begin, config_io, train
 from pegasus_jax.runs.evaluation import evaluate
-from pegasus_jax.runs.files import write_json
+from pegasus_jax.runs.files import strict, write_json
 from pegasus_jax.runs.job import Job, first_states, opened
 from pegasus_jax.runs.machine import about
 from pegasus_jax.runs.programs import share_cpus
@@ -93,6 +93,28 @@ def settings(way: str, off: str, words: dict[str, str]) -> Config:
     return config_io.parse({"task": "cartpole", **shared, **own})
 
 
+def name_of(way: str, off: str) -> str:
+    """A combination in a file of results."""
+    return f"{way} off={off}"
+
+
+def there(out: Path, asked: dict[str, Any]) -> dict[str, Any]:
+    """The combinations that a file has, if it is there. ConfigError for another file, and for one of other settings."""
+    if not out.exists():
+        return {}
+    try:
+        results = dict(json.loads(out.read_text())["results"])
+    except (ValueError, KeyError, TypeError):
+        what = f"out={out} is not a file of this command"
+        raise ConfigError(f"{what}; expected a new one, or one that it wrote") from None
+    for name in asked:
+        whole = results[name] if results.get(name, {}).get("whole") else {}
+        for key, value in strict(asked[name]).items():
+            if whole.get(key, value) != value:
+                raise ConfigError(f"out={out} has {name} with another {key}; expected the same, or another out=")
+    return results
+
+
 def table(results: dict[str, Any]) -> str:
     """A line for each seed, and one for each combination."""
     lines = []
@@ -117,23 +139,32 @@ def main(given: list[str]) -> None:
     if wrong := [way for way in ways if way not in WAYS] + [off for off in offs if off not in cartpole_by_hand.OFF]:
         raise ConfigError(f"{wrong[0]} is unknown; ways={[*WAYS]}, off={[*cartpole_by_hand.OFF]}")
     seeds, out = seed_list(options.get("seeds", "100-109")), Path(options.get("out", "runs/transfer.json"))
-    share_cpus(len(seeds))
-    done = json.loads(out.read_text()) if out.exists() else {"results": {}}
-    results: dict[str, Any] = done["results"]
-    told = about(shlex.join(["python", "-m", "benchmarks.robot.transfer", *given]))
+    trials, simulated_trials = number(options, "trials", 3), number(options, "simulated", 10)
     plain = {key: value for key, value in words.items() if key.partition(".")[0] not in WAYS}
+    asked = {
+        name_of(way, off): {
+            "seeds": seeds,
+            "simulated": simulated_trials if way in BEGUN else None,
+            "config": config_io.plain(settings(way, off, words | {"trials": str(trials)})),
+        }
+        for off in offs
+        for way in ways
+    }
+    results = there(out, asked)
+    share_cpus(len(seeds))
+    told = about(shlex.join(["python", "-m", "benchmarks.robot.transfer", *given]))
     for off in offs:
         old: tuple[RunState, list[float]] | None = None
         for way in ways:
-            name, began = f"{way} off={off}", time.monotonic()
+            name, began = name_of(way, off), time.monotonic()
             if results.get(name, {}).get("whole"):
                 continue
             if way in BEGUN and old is None:
-                old = simulated(plain, off, seeds, int(options.get("simulated", "10")))
+                old = simulated(plain, off, seeds, simulated_trials)
                 print(f"off={off}: success in the simulator {old[1]}", flush=True)
-            config = settings(way, off, words | {"trials": options.get("trials", "3")})
+            config = settings(way, off, words | {"trials": str(trials)})
             first = 0 if way != "none" else 1
-            results[name] = one = {"seeds": seeds, "first": first, "trials": [], "config": config_io.plain(config)}
+            results[name] = one = {**asked[name], "first": first, "trials": []}
             one["simulator"] = old[1] if old is not None and way in BEGUN else None
 
             def keep(rows: list[dict[str, Any]], one: dict[str, Any] = one, began: float = began) -> None:

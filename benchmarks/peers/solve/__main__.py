@@ -24,7 +24,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from benchmarks import RESULTS, command, number, only
+from benchmarks import RESULTS, command, number, only, stored_runs
 from benchmarks.peers.solve.attempt import PLANTS, PROGRAMS
 from benchmarks.peers.solve.shown import picture, table
 from benchmarks.plants_suite.__main__ import on_core
@@ -85,12 +85,7 @@ def one(plant: str, seed: int, program: str, options: dict[str, str]) -> dict[st
 
 def done(out: Path) -> list[dict[str, Any]]:
     """The runs of a file, if it is there, but those that failed. ConfigError for a file of something else."""
-    try:
-        return [run for run in json.loads(out.read_text())["runs"] if not run["error"]]
-    except FileNotFoundError:
-        return []
-    except (ValueError, KeyError, TypeError):
-        raise ConfigError(f"out={out} has no runs of this command; expected a new file, or one that it wrote") from None
+    return [run for run in stored_runs(out) if not run["error"]]
 
 
 def main(words: list[str]) -> None:
