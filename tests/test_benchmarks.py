@@ -31,6 +31,7 @@ from pegasus_jax import tasks
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli.train import understood
 from pegasus_jax.runs import config_io, machine
+from pegasus_jax.runs.study import SOLVED, first_solved
 from probes import unchecked
 
 TINY = {
@@ -319,6 +320,20 @@ def test_readme_reports_what_the_first_commands_learn_with():
     """The rows whose preset was measured as it is; a new one is welcome, none may go."""
     rows = {(row.preset, readme_table.changes(row, readme_table.pooled(row, RESULTS))) for row in readme_table.ROWS}
     assert rows >= {("cartpole_network", ""), ("double_cartpole_gpu", ""), ("cartpole", "")}
+
+
+def test_the_paper_has_the_numbers_that_are_stored():
+    """Those of README.md's tables: its own were once of seeds that are no longer stored."""
+    text = (results_page.README.parent / "paper.md").read_text()
+    result = readme_table.pooled(readme_table.ROWS[0], RESULTS)
+    seeds, rates = len(result["seeds"]), result["success_rate"]
+    solved = sum(rate[-1] >= SOLVED for rate in rates)
+    assert f"{solved} of {seeds} seeds of the cart-pole swing-up end" in text
+    first = sorted(first_solved(rate) for rate in rates)[seeds // 2]
+    seconds = result["plant_seconds"][first - 1]
+    assert f"in the median after {['', 'one', 'two', 'three'][first]} episodes, {seconds:g} s of plant time" in text
+    step = json.loads((RESULTS / "peers.json").read_text())["rows"]["cart-pole"]["ours_of_compiled"]
+    assert f"{step:.2f} of the time of the same step in compiled PyTorch" in text
 
 
 def test_studies_of_two_configs_are_not_one_row():
