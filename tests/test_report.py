@@ -7,8 +7,10 @@ import csv
 import io
 import json
 import re
+import shlex
 import shutil
 from dataclasses import replace
+from html import unescape
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -402,3 +404,14 @@ def test_a_browser_draws_the_page_and_asks_for_nothing_else(run: Path, sweep: Pa
     assert found["back"] == ("rgb(15, 19, 24)" if dark else "rgb(255, 255, 255)")
     assert seen["console"] == []
     assert [one for one in seen["asked"] if not one.startswith("data:")] == [address.as_uri()]
+
+
+def test_a_command_can_be_copied_where_a_folder_has_a_space(run: Path, tmp_path: Path) -> None:
+    """The words of a shell are split at spaces."""
+    spaced = shutil.copytree(run, tmp_path / "my runs" / "a b")
+    store.write_trials(spaced, [row(trial, **KNOWN) for trial in (1, 2)])  # of three
+    (made,) = build.write(build.report([spaced]), tmp_path / "report.html")
+    text = unescape(made.read_text(encoding="utf-8"))
+    for name, word in (("train", f"resume={spaced}"), *((one, str(spaced)) for one in ("eval", "play", "export"))):
+        assert f"pegasus-{name} {shlex.quote(word)} " in text
+    assert f"pegasus-report {shlex.quote(str(spaced))} film=true" in text

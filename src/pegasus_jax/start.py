@@ -14,6 +14,7 @@ from pegasus_jax.checks import ConfigError, brief, shown, size
 from pegasus_jax.config import Config, label
 from pegasus_jax.config_used import check_config, check_used, leaves
 from pegasus_jax.runs import trackers
+from pegasus_jax.shell import typed
 
 Mesh = Any  # a jax.sharding.Mesh; None: one device
 
@@ -243,8 +244,8 @@ def _summed_up(asked: Asked) -> None:
         told = restore.chosen(run, restore.BEST, restore.best(run))
         for line in filter(None, (display.limits_line(store.trials(run)), told)):
             print(f"seed {seed}: {line}" if len(asked.runs) > 1 else line)
-    home = asked.home
-    print(f"done: {home} (pegasus-report {home}, pegasus-eval {next(iter(asked.runs.values()))})")
+    home, one = asked.home, next(iter(asked.runs.values()))
+    print(f"done: {home} ({typed(['pegasus-report', str(home)])}, {typed(['pegasus-eval', str(one)])})")
 
 
 def _evenly(seeds: int) -> Mesh:

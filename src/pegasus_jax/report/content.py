@@ -22,6 +22,7 @@ from pegasus_jax.report.trajectories import fans, summary
 from pegasus_jax.runs import restore, store
 from pegasus_jax.runs.best import judging
 from pegasus_jax.runs.display import duration
+from pegasus_jax.shell import typed
 from pegasus_jax.tasks import guide
 
 WIDTHS = ("policy.hidden", "policy.num_centers", "model.hidden")  # how large what was learned is
@@ -123,7 +124,7 @@ def film(found: Look) -> str:
     """RUN/play.mp4, where pegasus-play has made one."""
     path = found.path / "play.mp4"
     if not path.is_file():
-        command = f"pegasus-report {found.path} film=true"
+        command = typed(["pegasus-report", str(found.path), "film=true"])
         return f'<p class="soft">None yet. <code>{escape(command)}</code> films the best policy on its plant.</p>'
     address, still = data("video/mp4", path.read_bytes()), picture(path)
     poster = f' poster="{data("image/png", still)}"' if still else ""
@@ -146,16 +147,16 @@ def policy(found: Look) -> str:
     """What the best policy is, and how to use it."""
     if found.best is None or not found.rows:
         return ""
+    use = lambda command: escape(typed([f"pegasus-{command}", str(found.path)]), quote=False)  # noqa: E731
     plain = read.config_io.plain(found.config)
     sizes = ", ".join(f"{name}={shown(plain[name])}" for name in WIDTHS if name in plain)
-    run = escape(str(found.path))
     names = f"sees {', '.join(found.task.state_names)}; sends {', '.join(found.task.control_names)}"
     return (
         f"<p>The policy after {best(found).replace('<small>', '(').replace('</small>', ')')}. {escape(sizes)}. It"
         f" {escape(names)}, every {found.task.dt:g} s.</p>"
-        f"<pre>pegasus-eval {run}                 # its cost and success in new episodes\n"
-        f"pegasus-play {run}                 # a film\n"
-        f"pegasus-export {run}               # one file that needs no JAX</pre>"
+        f"<pre>{use('eval')}                 # its cost and success in new episodes\n"
+        f"{use('play')}                 # a film\n"
+        f"{use('export')}               # one file that needs no JAX</pre>"
     )
 
 

@@ -13,6 +13,7 @@ from pegasus_jax.config_models import BNN, Lagrangian, several
 from pegasus_jax.report.read import Look, coverage, model_of
 from pegasus_jax.runs.store import cost_since
 from pegasus_jax.runs.stuck import AT_LIMITS, stuck
+from pegasus_jax.shell import typed
 
 TOO_SURE, TOO_UNSURE = 2.0, 0.5  # errors of a model, in what it predicts for them
 COVERED = 0.6  # of a real episode's states lie among the imagined ones; 0.9 would be honest
@@ -41,7 +42,8 @@ def _files(found: Look) -> Iterator[Finding]:
     missing = found.config.trials - len(found.rows)
     if missing > 0:
         done = f"{len(found.rows)} of {found.config.trials} trials are done"
-        yield Finding("note", done, f"The run goes on, or was stopped: pegasus-train resume={found.path} continues it.")
+        command = typed(["pegasus-train", f"resume={found.path}"])
+        yield Finding("note", done, f"The run goes on, or was stopped: {command} continues it.")
     now, then = metadata.version("pegasus-jax"), (found.about.get("versions") or {}).get("pegasus-jax")
     if then != now:
         yield Finding("note", f"made by version {then}, reported by {now}", "Settings may have other defaults now.")
