@@ -9,6 +9,7 @@ from concurrent.futures import ThreadPoolExecutor, as_completed
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pegasus_jax import interrupt
 from pegasus_jax.checks import ConfigError, RunError, did_you_mean
 from pegasus_jax.cli import help
 
@@ -40,7 +41,7 @@ def command(main: Callable[[list[str]], int | None], what: str | None) -> None:
         sys.exit(f"{name}: {refused(error)}")
     except KeyboardInterrupt:
         print(f"{name}: stopped", file=sys.stderr)
-        sys.exit(130)
+        interrupt.end(130)  # a compiling thread would be waited for, and then abort the process
     if status:
         sys.exit(status)
 

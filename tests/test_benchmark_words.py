@@ -84,6 +84,19 @@ def test_a_file_and_ctrl_c_are_one_line(raised, status, said, tmp_path):
     assert (done.returncode, done.stderr) == (status, said)
 
 
+def test_ctrl_c_waits_for_no_thread(tmp_path):
+    """One that compiles would end the process by SIGABRT, after `stopped`."""
+    file = tmp_path / "main.py"
+    file.write_text(
+        "import benchmarks, threading, time\n"
+        "def main(words):\n"
+        "    threading.Thread(target=time.sleep, args=(600,)).start()\n"
+        "    raise KeyboardInterrupt\n"
+        "benchmarks.command(main, '')\n"
+    )
+    assert ended([str(file)]).returncode == 130
+
+
 def test_a_reader_that_goes_away_is_no_traceback(tmp_path):
     file = tmp_path / "main.py"
     file.write_text("import benchmarks\nbenchmarks.command(lambda words: print('x' * 1_000_000), '')\n")
