@@ -29,7 +29,7 @@ KEPT = (
 def robot(options: dict[str, str]) -> Path:
     """The folder of robot.py, from which every run imports. Raises ConfigError where there is none."""
     if "furuta" not in options:
-        raise ConfigError("furuta= is missing: the folder of robot.py; for example furuta=shared/furuta")
+        raise ConfigError("furuta= is missing: the folder of robot.py; for example furuta=robots/furuta")
     folder = Path(options["furuta"]).absolute()
     if not (folder / "robot.py").is_file():
         raise ConfigError(f"furuta={folder} has no robot.py")
