@@ -176,6 +176,14 @@ def test_a_damaged_run_json_is_named(run: Path, content: bytes) -> None:
     assert "run.json is damaged" in said or "noted no facts of its task" in said
 
 
+@pytest.mark.parametrize("bound", ["x", None, [0.1], {}])
+def test_a_constraint_whose_bound_is_no_number_is_damage(run: Path, bound: Any) -> None:
+    told = json.loads((run / "run.json").read_text())
+    told["task"]["constraint_bound"] = bound
+    (run / "run.json").write_text(json.dumps(told))
+    assert "run.json is damaged" in refused(store.task_of, run)
+
+
 def test_a_run_of_an_older_version_says_which(run: Path) -> None:
     told = json.loads((run / "run.json").read_text())
     del told["task"]

@@ -76,14 +76,15 @@ def to_task(found: Any, where: str) -> Task:
             **{name: float(_numbers([found[name]], 1)[0]) for name in NUMBERS},
             "circles": tuple(_pair(pair, states + len(found["circles"])) for pair in found.get("circles", ())),
         }
+        bound = _numbers([found["constraint_bound"]], 1)[0] if "constraint_bound" in found else None
     except (KeyError, TypeError, ValueError) as error:
         raise RunError(f"{where} is damaged: its task has no usable {str(error) or 'facts'}") from error
     from pegasus_jax.imagine.limits import Constraint
     from pegasus_jax.task import Task
     from pegasus_jax.types import Cost
 
-    if "constraint_bound" in found:
-        known["constraint"] = Constraint(unknown_cost, _numbers([found["constraint_bound"]], 1)[0])
+    if bound is not None:
+        known["constraint"] = Constraint(unknown_cost, bound)
     task = Task(plant=None, cost=Cost(unknown_cost, unknown_cost), **known)
     return _asking(task, found, where) if "terms" in found else task
 
