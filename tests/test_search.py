@@ -253,6 +253,22 @@ def rowless(params, posterior, target, row):
 STILL = lambda *_: jnp.zeros(3)  # noqa: E731
 
 
+@pytest.mark.parametrize(
+    "optimizer",
+    [optax.lbfgs(), optax.chain(optax.adam(0.05), optax.contrib.reduce_on_plateau(patience=2))],
+    ids=["line search", "told the loss"],
+)
+@pytest.mark.parametrize("constrained", [False, True])
+def test_a_table_of_plain_steps_takes_those_of_the_printed_search_with_any_optimizer(optimizer, constrained):
+    value = (lambda *given: (rowless(*given[:4]), jnp.float32(0))) if constrained else rowless
+    ascend = (lambda multiplier, chance: multiplier) if constrained else None
+    found, learner = on_table(search_table(6), optimizer, value=value, ascend=ascend)
+    after, info = jax.jit(partial(found.run, steps=6))(jax.random.key(7), learner, 1.0)
+    plain, expected = pursue(optimizer, 6)(jax.random.key(7), begin(optimizer), 1.0)
+    np.testing.assert_allclose(after.params, plain.params, rtol=1e-5)
+    np.testing.assert_allclose(info.objective, expected.objective, rtol=1e-5)
+
+
 @pytest.mark.parametrize("calls", [1, 2, 3])
 def test_a_search_that_loses_what_it_found_ends_with_what_it_had_before_it_refined(calls):
     """Three steps find something better than what was given, three of ten thousand times the size lose it again."""

@@ -83,9 +83,9 @@ def search(
         learner, i = entered(now, learner, problem.optimizer), now.iteration - offset
         visited = candidate(now, learner, fresh if asks else None)
         scenarios = sampler.redraw(key, now.scenarios, scenarios, posterior, k == 0)
-        value, gradient, weight = valued(problem, learner.optimizer, visited, posterior, scenarios, now)
-        learner, cost, skipped = after(now, learner, visited, value, gradient, weight, problem)
-        norm, stepped = optax.tree.norm(gradient), jnp.where(now.action == STEP, i, steps)
+        seen = valued(problem, learner.optimizer, visited, posterior, scenarios, now)
+        learner, cost, skipped = after(now, learner, seen, problem)
+        norm, stepped = optax.tree.norm(seen.gradient), jnp.where(now.action == STEP, i, steps)
         norms = info.gradient_norm.at[stepped].set(norm, mode="drop")
         found = SearchInfo(info.objective.at[i].set(cost), norms, info.skipped + skipped, i + 1)
         return k + 1, learner, scenarios, found

@@ -1,6 +1,6 @@
-"""What a row of a search's table makes of the parameters that it visits: their cost and gradient, then the next ones.
+"""One row of a search's table: the cost and the gradient at the parameters that it visits, then the next parameters.
 
-Where there is a constraint its multiplier ascends beside the policy's descent.
+With a constraint, its multiplier ascends while the policy descends.
 """
 
 from collections.abc import Callable
@@ -51,7 +51,7 @@ def renewed(problem: Any, learner: TrainState) -> TrainState:
     params, state = learner
     optimizer = problem.optimizer.init(params) if problem.reset_optimizer else state.optimizer
     count = state.worked + 1
-    # What took its place has just failed on the plant: this search only refines, and whole ones are rarer from now on.
+    # The policy that replaced it has just failed on the plant: this search only refines, and whole ones become rarer.
     count = jnp.where(jnp.asarray(problem.works) > 1, 2 * count + 1, count)
     worked = jnp.where(problem.works, count, 0)
     new = dict(optimizer=optimizer, start=params, worked=worked, progress=unrefined(), widening=jnp.ones((), float))
@@ -59,66 +59,69 @@ def renewed(problem: Any, learner: TrainState) -> TrainState:
 
 
 def only_refines(table: SearchTable, worked: Array) -> Array:
-    """Whether a search skips what comes before its refinement, where `worked` [] in a row were given what works.
+    """[] whether a search skips all that comes before its refinement; see `SearchState.worked` for `worked` [].
 
-    Of a table that compares with a fresh policy, or races with one, the 1st, 2nd, 4th, 8th, ... of them do all of it,
-    from that: one that works may be far from the best, and then a refinement does not find that (docs/decisions.md
-    0035).
+    Where the table also tries a fresh policy, the 1st, 2nd, 4th, 8th, ... of these searches do all of it: a policy that
+    works may be far from the best, and a refinement alone does not find a better one (docs/decisions.md 0035).
     """
     compares = ((table.candidate == FRESH) & (table.action != STEP) | (table.candidate == LEADER)).any()
     return worked & (worked - 1) != 0 if compares else worked > 0
 
 
-def valued(problem: Any, state: Any, *given: Any) -> tuple[Array, Params, Array | None]:
-    """A problem's objective, its gradient with respect to the first of `given`, and the multiplier after a step.
+class Visit(NamedTuple):
+    """What a row of the table finds at the parameters that it visits."""
 
-    The last of `given` is the row.
-    """
-    given, multiplier = (*given[:-1], widened(given[-1], state.widening)), state.multiplier
+    params: Params
+    value: Array  # [] the objective there
+    gradient: Params
+    multiplier: Array | None  # [] of a constraint's penalty, after a step from there; None: there is no constraint
+    objective: Callable[[Params], Array]  # under the row's scenarios, for an optimizer that evaluates it elsewhere
+
+
+def valued(
+    problem: Any, state: SearchState, params: Params, posterior: Params, scenarios: Params, row: SearchTable
+) -> Visit:
+    """A problem's objective at these parameters, and its gradient there, as a row of the table asks for it."""
+    given, multiplier = (posterior, scenarios, widened(row, state.widening)), state.multiplier
     if problem.ascend is None:
-        return *jax.value_and_grad(problem.objective)(*given), None
-    (value, chance), gradient = jax.value_and_grad(problem.objective, has_aux=True)(*given, multiplier)
-    return value, gradient, problem.ascend(multiplier, chance)
+        objective = lambda params: problem.objective(params, *given)  # noqa: E731
+        return Visit(params, *jax.value_and_grad(objective)(params), None, objective)
+    both = lambda params: problem.objective(params, *given, multiplier)  # noqa: E731
+    (value, chance), gradient = jax.value_and_grad(both, has_aux=True)(params)
+    return Visit(params, value, gradient, problem.ascend(multiplier, chance), lambda params: both(params)[0])
 
 
-def after(
-    row: SearchTable,
-    learner: TrainState,
-    visited: Params,
-    value: Array,
-    gradient: Params,
-    multiplier: Array | None,
-    problem: Any,
-) -> tuple[TrainState, Array, Array]:
-    """What a row makes of the cost and gradient of what it visited -> (learner, cost of its parameters, skipped)."""
+def after(row: SearchTable, learner: TrainState, visit: Visit, problem: Any) -> tuple[TrainState, Array, Array]:
+    """What a row makes of its visit -> (learner, cost of the learner's parameters before a step, update skipped)."""
+    value, gradient = visit.value, visit.gradient
     (params, state), finite, steps_now = learner, is_finite((value, gradient)), row.action == STEP
-    # Which policy is taken says `SearchTable.candidate`. A tie leaves CURRENT: where a cost is flat nothing else does.
-    # What is not a number, because a particle went to infinity, loses.
+    # `SearchTable.candidate` says which policy is taken. On a tie it is not CURRENT: on a flat cost the search would
+    # never leave that. A cost of NaN loses: one of its particles went to infinity.
     lost = jnp.isnan(state.last)
     older, less = (value <= state.last) | lost, (value < state.last) | lost
-    # A fresh policy is also where a search begins that is to find another than the given one.
+    # The fresh policy is also taken where the search is to find another policy than the given one.
     fresh = older | (state.no_improvement | (state.worked > 0)) & ~jnp.isnan(value)
     taken = jnp.stack([True, fresh, True, less, older, older])[row.candidate] | steps_now
-    params, state = optax.tree.where(taken, visited, params), returned(row, taken, state)
-    now = TrainState(params, state.optimizer)
-    updates, moved = update_if(steps_now & finite, problem.optimizer, gradient, now, value=value)
+    params, state = optax.tree.where(taken, visit.params, params), returned(row, taken, state)
+    now, more = TrainState(params, state.optimizer), dict(value=value, grad=gradient, value_fn=visit.objective)
+    updates, moments = update_if(steps_now & finite, problem.optimizer, gradient, now, **more)
     found = state._replace(
-        optimizer=moved,
+        optimizer=moments,
         start=optax.tree.where(row.candidate >= START, params, state.start),
         last=value,
         progress=after_row(state.progress, row, value),
         widening=after_step(state.widening, row, value),
         no_improvement=jnp.where(row.candidate == START, taken, state.no_improvement),
-        # After a step only: what rows compare is weighed alike.
-        multiplier=None if multiplier is None else jnp.where(steps_now, multiplier, state.multiplier),
+        # After a step only: rows that compare policies count the constraint by the same multiplier.
+        multiplier=None if visit.multiplier is None else jnp.where(steps_now, visit.multiplier, state.multiplier),
     )
     params = optax.apply_updates(params, optax.tree.scale(row.step_size, updates))
     return TrainState(params, found), jnp.where(taken, value, state.last), steps_now & ~finite
 
 
 def of_search(table: SearchTable, earlier: Array | int) -> SearchTable:
-    """The table [R] of the search after `earlier` others. Its numbers are data: no search compiles another program."""
-    # Where all are alike there is no choice to make: of searches vmapped over `earlier` each would have its own.
+    """The table [R] of the search after `earlier` others, as arrays: every search runs the same compiled program."""
+    # One row of factors serves all searches: indexing it by a vmapped `earlier` would copy it for each.
     number = jnp.minimum(earlier, most) if (most := len(table.limit) - 1) else 0
     return SearchTable(*map(jnp.asarray, table[:-3]), *(jnp.asarray(column)[number] for column in table[-3:]))
 
