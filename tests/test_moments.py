@@ -164,6 +164,13 @@ def test_matched_particles_forget_where_each_was():
     assert keep(x, z) is x
 
 
+@pytest.mark.parametrize("particles", [1, 2, 3])
+def test_standardize_refuses_fewer_particles_than_have_a_covariance(particles):
+    """Three particles in three dimensions lie in a plane: across it their noise would silently be 0."""
+    with pytest.raises(ValueError, match=f"{particles} particles are too few .* 3 dimensions; expected at least 4"):
+        standardize(jnp.ones((2, particles, 3)))
+
+
 def test_standardize_is_idempotent_and_works_on_every_time_step_alone():
     z = jnp.asarray(np.random.default_rng(2).normal(size=(4, 9, 3)) * 5 + 2, jnp.float32)
     once = standardize(z)

@@ -35,10 +35,11 @@ def blocks(
     standardized_noise: bool = False,
     spread: Spread = together,
 ) -> Blocks:
-    """How each part of the scenarios is drawn; `start` draws a first state [D], the policy's memory what is known.
+    """How each part of the scenarios is drawn; `start` draws a first state [D], the policy's memory its first m [M].
 
     With `standardized_noise`, the normal draws of every time step have exactly zero mean and unit covariance over the
-    particles, so that matched particles have exactly the moments asked for. `spread` lays particles out over devices.
+    particles, so that matched particles have exactly the moments asked for: K <= D + M then raises ValueError, while it
+    is traced. `spread` lays particles out over devices.
     """
 
     deal = dynamics.deal or jax.vmap(dynamics.sample, (0, None))
@@ -78,10 +79,7 @@ def draw(key: Key, step: Array | int, posterior: Params, *, blocks: Blocks, peri
 
 
 def begin(key: Key, step: Array, posterior: Params, *, blocks: Blocks, period: Period) -> Scenarios:
-    """What a loop that redraws in each round has before its first: the blocks that last a search, zeros of the others.
-
-    So its program has one way to draw each block.
-    """
+    """The scenarios before a loop of `redraw`: blocks that last for the whole search, zeros in place of the others."""
     drawing = partial(draw, blocks=blocks, period=period)
     nothing = jax.tree.map(jnp.zeros_like, jax.eval_shape(drawing, key, step, posterior))
     return nothing._replace(**_of_period(0, drawing(key, step, posterior), period)) if 0 in period else nothing
@@ -90,9 +88,9 @@ def begin(key: Key, step: Array, posterior: Params, *, blocks: Blocks, period: P
 def redraw(
     key: Key, step: Array, scenarios: Scenarios, posterior: Params, begins: Array, *, blocks: Blocks, period: Period
 ) -> Scenarios:
-    """`draw` for an iteration, from those of it or of the one before; draws only the blocks that may change.
+    """`draw` for iteration `step`, from the `scenarios` of this iteration or of the one before.
 
-    Where a loop `begins`, [], `scenarios` are what `begin` says.
+    Only blocks that may change are drawn. Where a loop `begins`, [], `scenarios` come from `begin`.
     """
     renewed = {}
     for every in sorted(set(period) - {0}):
@@ -100,15 +98,15 @@ def redraw(
         def fresh(every: int = every) -> dict[str, Params]:
             return _of_period(every, draw(key, step, posterior, blocks=blocks, period=period), period)
 
-        def held(every: int = every) -> dict[str, Params]:
+        def kept(every: int = every) -> dict[str, Params]:
             return _of_period(every, scenarios, period)
 
-        renewed |= fresh() if every == 1 else jax.lax.cond(begins | (step % every == 0), fresh, held)
+        renewed |= fresh() if every == 1 else jax.lax.cond(begins | (step % every == 0), fresh, kept)
     return scenarios._replace(**renewed)
 
 
 def _of_period(every: int, scenarios: Scenarios, period: Period) -> dict[str, Params]:
-    """The blocks that are drawn every so many iterations; of those just drawn the others are dead code."""
+    """The blocks with this period, by name; the compiler leaves out the draws of all others."""
     blocks = zip(Scenarios._fields, scenarios, period, strict=True)
     return {name: block for name, block, lasts in blocks if lasts == every}
 

@@ -58,7 +58,15 @@ def mean_and_cov(x: Array) -> tuple[Array, Array]:
 
 
 def standardize(z: Array) -> Array:
-    """Draws z [..., K, D] with their sample mean made exactly 0 and sample covariance exactly I, over K."""
+    """Draws z [..., K, D] with their sample mean made exactly 0 and sample covariance exactly I, over K.
+
+    Raises ValueError where K <= D: so few draws have a singular covariance, and some directions would get no noise.
+    """
+    if z.shape[-2] <= z.shape[-1]:
+        raise ValueError(
+            f"{z.shape[-2]} particles are too few for standardized noise of {z.shape[-1]} dimensions; expected at least"
+            f" {z.shape[-1] + 1}"
+        )
 
     def one(z: Array) -> Array:
         mean, cov = mean_and_cov(z)
