@@ -13,7 +13,7 @@ from pegasus_jax.shapes import check_shape
 from pegasus_jax.task import Task
 from pegasus_jax.types import Array, Key, Trajectory
 
-CUT = ("error", "interrupted")  # how an episode can end by no doing of its policy
+CUT = ("error", "interrupted")  # ends that say nothing of the policy
 
 
 class Episode(NamedTuple):
@@ -21,7 +21,7 @@ class Episode(NamedTuple):
 
     trajectory: Trajectory
     ended: str = "horizon"  # or terminated, truncated; error, interrupted
-    error: BaseException | None = None  # what it was raised
+    error: BaseException | None = None  # what was raised
 
 
 def run(key: Key, act: Callable[[Key, Array, Array], Array], task: Task) -> Trajectory:
@@ -98,9 +98,9 @@ def drive(seed: int, act: Callable[[int, np.ndarray], Any], task: Task) -> Episo
     """At most H control periods of act(t, x [D]) -> u [U] on the task's environment; its rows are NumPy's, of NaN cost.
 
     `terminated` and `truncated` end it, and so does what the environment raises, an observation that is not finite, and
-    a signal: then `error` says what, the rows so far are kept, and the environment is closed before this returns. Else
-    it rests: what follows takes time. A request to stop is looked at before every control. Rows hold the controls as
-    they were sent.
+    a signal: then `error` is what was raised, the rows so far are kept, and the environment is closed before this
+    returns. Otherwise its `rest` is called, as fit and search take time. Before every control a request to stop is
+    checked. Rows hold the controls as they were sent.
     """
     rows, ended, error, first = [], "horizon", None, None
     try:

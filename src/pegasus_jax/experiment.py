@@ -37,8 +37,8 @@ from pegasus_jax.types import (
     Trajectory,
 )
 
-# What the key of a trial is folded with, so that no two draws share a key. `init` has the first two of trial 0: no
-# episode runs in it, and only logs are fitted.
+# What the key of a trial is folded with, so that no two draws share a key. `init` uses the first two of trial 0, in
+# which no episode runs and no data are there to be fitted.
 COLLECT, FIT, SEARCH, IMAGINE, EVALUATE, RESTART, CALIBRATE = range(7)
 
 

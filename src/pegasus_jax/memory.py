@@ -1,8 +1,8 @@
 """What a controller knows exactly beside its newest observation: values that make a `Memory`, and how they are used.
 
 A state of a rollout is x' = [x, m]: x [D] is what a model predicts, m [M] is computed. A memory is a machine with one
-step a control period: it holds m when the observation o [O] comes, the policy sees `see(o, m)`, and `advance` takes the
-observation and the control in. The same functions run in imagination, on a plant in JAX, on an environment and in an
+step a control period: it holds m when the observation o [O] comes, the policy sees `see(m, o)`, and `advance(m, o, u)`
+makes the next m. The same functions run in imagination, on a plant in JAX, on an environment and in an
 exported controller.
 """
 
@@ -132,18 +132,18 @@ def steps(memory: Memory) -> tuple[Callable[..., Array], Callable[..., Array], C
 
 
 def given_size(memory: Memory, controls: int) -> int:
-    """V."""
+    """V, the entries of what the model is given as the control."""
     m = jnp.zeros(len(memory.names)) if memory.names else None
     return jax.eval_shape(steps(memory)[1], m, jnp.zeros(controls)).shape[0]
 
 
 def measured(task: Task) -> tuple[int, ...]:
-    """The entries of the state that an observation tells; of the others it has something that nobody looks at."""
+    """The entries of the state that the sensors measure; what an observation has in the other entries is not used."""
     return tuple(range(len(task.state_names))) if task.memory.measured is None else task.memory.measured
 
 
 def units(memory: Memory) -> tuple[float, ...]:
-    """How large each of what the policy is shown is."""
+    """The unit of each entry that the memory shows to the policy."""
     return memory.shown_units or (1.0,) * len(memory.shown)
 
 
@@ -175,11 +175,11 @@ def seen_angles(task: Task) -> tuple[int, ...]:
 
 
 def replay(memory: Memory, trajectory: Trajectory) -> Array | None:
-    """m [H+1, M] along an episode, from its observations and controls; rows behind its end say nothing."""
+    """m [H+1, M] along an episode, from its observations and controls; rows after its end have no meaning."""
     if not memory.names:
         return None
     o, u = jnp.asarray(trajectory.x), jnp.asarray(trajectory.u)
-    # An episode from elsewhere does not tell what was drawn for it.
+    # An episode that was not run here does not store what was drawn for it.
     first: Any = begin(memory, jax.random.key(0), o[0]) if trajectory.memory is None else jnp.asarray(trajectory.memory)
 
     def step(m: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:

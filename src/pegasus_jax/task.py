@@ -37,8 +37,8 @@ class Task(NamedTuple):
     # The entries of x that are rates of its other entries, in the order of those; (): x is not made of such pairs.
     rates: tuple[int, ...] = ()
     success: float = 0.2  # a rollout whose last five steps cost less than this on average has succeeded
-    # reset(seed) -> x [D]; step(u [U]) -> (x [D], the control sent [U], how it ended or ""); close(). A plant outside
-    # of JAX, of which there is one: a Gymnasium environment, maybe a robot.
+    # reset(seed) -> x [D]; step(u [U]) -> (x [D], the control sent [U], how it ended or ""); rest(), after an episode;
+    # close(). The one plant outside of JAX: a Gymnasium environment, maybe a robot.
     environment: Any = None
     # x [D] -> probability that an episode ends there; None: it ends at the horizon, or where the environment says so
     stop: Callable[[Array], Array] | None = None

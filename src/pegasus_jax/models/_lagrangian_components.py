@@ -1,4 +1,4 @@
-"""Lagrange's equations of `dynamics/lagrangian` by components, for blocks of B particles: what a GPU kernel can do.
+"""Lagrange's equations of `models/lagrangian` by components, for blocks of B particles: what a GPU kernel can do.
 
 A kernel has no small matrices, so each of their entries is an array [B] of its own. Its network is of [B, W].
 """
@@ -21,7 +21,7 @@ State = tuple[Array, ...]  # 2n of [B]: the coordinates, then their speeds
 
 
 class Mechanism(NamedTuple):
-    """What the equations need of a posterior. Here, the numbers and rows; in `mechanics_kernel` also whole arrays."""
+    """What the equations need of a posterior: numbers and rows here, whole arrays outside of the GPU kernel."""
 
     centre: Any  # [n]
     spread: Any  # [n]

@@ -72,8 +72,8 @@ def gp(*, states: int, controls: int, angles: tuple[int, ...], features: int = 2
         noise = h.noise[:, None] * jax.random.normal(noise_key, posterior.y.shape, dtype)
         # One output after the other: with many particles the features of all rows at once would fill the memory.
         prior = jax.lax.map(lambda wave: kernels.waves(posterior.x @ wave[0].T) @ wave[1], (frequencies, weights))
-        nll = jnp.where(posterior.used, posterior.y - prior - noise, 0)
-        return Draw(frequencies, weights, solve(posterior.root, nll))
+        residual = jnp.where(posterior.used, posterior.y - prior - noise, 0)
+        return Draw(frequencies, weights, solve(posterior.root, residual))
 
     def apply(posterior: Posterior, draw: Draw, x: Array, u: Array) -> Prediction:
         h, scaling = posterior.hyper, posterior.scaling

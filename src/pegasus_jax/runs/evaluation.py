@@ -52,9 +52,9 @@ def driven(keys: Key, params: Params, task: Task, program: Program) -> np.ndarra
 def saturated(u: Any, task: Task) -> dict[str, Any]:
     """The share of an episode's controls [H, U] that are within 1 % of a limit: of all, and of each by its name."""
     low, high = np.asarray(task.control_low), np.asarray(task.control_high)
-    margin = 0.01 * (high - low)
+    near = 0.01 * (high - low)
     u = np.asarray(u)
-    shares = np.mean((u < low + margin) | (u > high - margin), axis=0)
+    shares = np.mean((u < low + near) | (u > high - near), axis=0)
     each = dict(zip(task.control_names, shares.tolist(), strict=True))
     return {"saturated": float(np.mean(shares)), "saturated_controls": each}
 
@@ -64,8 +64,8 @@ def kept_to(ran: Episode, task: Task) -> dict[str, Any]:
     if task.constraint is None:
         return {}
     x = np.asarray(ran.trajectory.x)[1:]
-    over = np.asarray(margin(jnp.asarray(x, float), task.constraint)) > 0
-    return {"constraint_broken": bool(over.any()), "constraint_rows": float(over.mean()) if over.size else 0.0}
+    broken = np.asarray(margin(jnp.asarray(x, float), task.constraint)) > 0
+    return {"constraint_broken": bool(broken.any()), "constraint_rows": float(broken.mean()) if broken.size else 0.0}
 
 
 def evaluate_run(

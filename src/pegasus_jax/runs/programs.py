@@ -336,5 +336,5 @@ def is_main_process() -> bool:
 
 
 def chunk(steps: int) -> int:
-    """Search iterations between two looks at the clock: a divisor of `steps` near a tenth of it."""
+    """Search iterations of one call of the program: the smallest divisor of `steps` that is at least a twentieth."""
     return next(d for d in range(-(-steps // 20), steps + 1) if steps % d == 0)

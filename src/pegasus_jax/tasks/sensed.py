@@ -37,8 +37,8 @@ def sensed(task: Task, sensors: Sensors) -> Task:
         return with_rates(task) if computed else task
     kept = measured = entries(task, sensors)
     if computed:
-        rate_of = dict(zip(coordinates(task), task.rates, strict=True))
-        kept = sorted({*measured, *(rate_of[i] for i in measured)})
+        rate_at = dict(zip(coordinates(task), task.rates, strict=True))
+        kept = sorted({*measured, *(rate_at[i] for i in measured)})
     if len(kept) < len(task.state_names):
         task = reduced(task, kept)
     return delayed(task, sensors.delay) if sensors.delay and task.plant is not None else task
@@ -218,8 +218,8 @@ def _paired(task: Task, kept: list[int]) -> tuple[int, ...]:
         others = [i for i in others if i in kept]
     if len(others) != len(task.rates):
         return ()
-    rate_of = dict(zip(others, task.rates, strict=True))
-    rates = [rate_of[i] for i in kept if i in rate_of]
+    rate_at = dict(zip(others, task.rates, strict=True))
+    rates = [rate_at[i] for i in kept if i in rate_at]
     return tuple(map(kept.index, rates)) if {*rates} == {*kept} & {*task.rates} else ()
 
 
