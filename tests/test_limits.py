@@ -147,7 +147,7 @@ def test_a_particle_stays_where_it_is_over():
         (RAIL, lambda x: x[1] > 3, [1, 1, 0, 0, 0]),
         (None, None, [1, 1, 1, 1, 1]),
     ):
-        apply, expected = limits.held(drift, constraint, stop).apply, np.outer(moves, [1, 1])
+        apply, expected = limits.absorbing(drift, constraint, stop).apply, np.outer(moves, [1, 1])
         np.testing.assert_array_equal(for_particles(apply)(None, none, x, none).mean, expected)
         np.testing.assert_array_equal([apply(None, none[0], row, none[0]).mean for row in x], expected)
 

@@ -103,7 +103,7 @@ def search_of(
         around = jnp.asarray(task.start_mean, float)
         searched = blocks._replace(start=beside_visited(blocks.start, search.visited_starts, task.angles, around))
     pieces: dict[str, Any] = dict(policy=policy, noise=noise)
-    pieces["dynamics"] = limited.held(dynamics, task.constraint, task.stop)
+    pieces["dynamics"] = limited.absorbing(dynamics, task.constraint, task.stop)
     # A particle's cost is 1 / K of the objective.
     limit = None if (most := search.particle_grad_limit) is None else most / search.particles
     objective_of, ascend = objective, None

@@ -30,7 +30,7 @@ __all__ = [
 OfState = Callable[[Array], Array]  # x [D] -> scalar
 Error = Callable[[Array], Array]  # x [D] -> e [E], affine in the features of x
 
-NODES = 512  # at which a cost whose expectation has no closed form is looked at
+NODES = 512  # points of the quadrature for a cost whose expectation has no closed form
 
 
 def saturating(error: Error, width: Array | float, angles: tuple[int, ...]) -> Cost:
@@ -79,15 +79,15 @@ def widened(cost: Cost, factor: Array | float) -> Cost:
 
     def of_state(x: Array) -> Array:
         rest = 1 - _scalar(cost.of_state(x))
-        held = jnp.maximum(rest, jnp.finfo(rest.dtype).eps)  # at c = 1 the slope is infinite: there take that of c
-        return 1 - held**factor**-2 + (held - rest)
+        floored = jnp.maximum(rest, jnp.finfo(rest.dtype).eps)  # at c = 1 the slope is infinite: take that of c there
+        return 1 - floored**factor**-2 + (floored - rest)
 
     known, nodes = cost.expected, expected_by_nodes(of_state)
     return Cost(of_state, None if known is None else lambda *x: jax.lax.cond(jnp.equal(factor, 1), known, nodes, *x))
 
 
 def blind_to_memory(cost: Cost, states: int) -> Cost:
-    """The cost of x' [D + M], what is remembered beside x, whose first D entries a cost of x [D] is of."""
+    """A cost of x [D] as one of x' [D + M], which has the memory behind x: it reads the first D entries only."""
     expected, widen = cost.expected, cost.widen
     return Cost(
         wraps(cost.of_state)(lambda x: cost.of_state(x[:states])),
@@ -125,7 +125,7 @@ def normal_nodes(count: int, size: int) -> np.ndarray:
 
     The normal's quantiles of Sobol's sequence, each moved to the middle of its interval, as none may be at 0.
     """
-    # Never first in a thread beside one that imports PyTorch: SciPy asks for what a half of it has not got. runs/job.py
+    # Not first in a thread while another one imports PyTorch: SciPy would use the half-imported module (runs/job.py).
     from scipy.stats import norm, qmc  # slow to import, and only a cost of one's own needs them
 
     intervals = 2 ** (count - 1).bit_length()

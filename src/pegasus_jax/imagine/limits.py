@@ -18,7 +18,7 @@ from pegasus_jax.vectorized import Vectorized, for_particles
 FIRST, MOST = 1.0, 100.0  # multipliers
 RATE = 0.1  # by which the multiplier moves in an iteration, times how far the probability is from its bound
 WIDTH = 0.05  # of the penalty's bend at the limit, as a part of the way from the start to the limit
-GROSS = 1.0  # as far beyond the limit as the start is before it: no more is asked of a model there
+GROSS = 1.0  # as far beyond the limit as the start is before it: from there on particles stand still
 
 
 class Constraint(NamedTuple):
@@ -43,8 +43,8 @@ def probability(x: Array, constraint: Constraint) -> Array:
 
     One that begins beyond the limit says nothing of its policy, and does not count; one that goes to infinity does.
     """
-    over = ~(margin(x, constraint) <= 0)
-    return jnp.sum(jnp.any(over[1:], 0) & ~over[0]) / jnp.maximum(jnp.sum(~over[0]), 1)
+    broken = ~(margin(x, constraint) <= 0)  # NaN breaks it
+    return jnp.sum(jnp.any(broken[1:], 0) & ~broken[0]) / jnp.maximum(jnp.sum(~broken[0]), 1)
 
 
 def penalty(x: Array, constraint: Constraint) -> Array:
@@ -96,10 +96,10 @@ def constrained(
     return value, probability(x, constraint)
 
 
-def held(dynamics: Dynamics, constraint: Constraint | None, stop: Callable[[Array], Array] | None) -> Dynamics:
-    """The same model, in which a particle stays where it stopped, or is grossly beyond the limit.
+def absorbing(dynamics: Dynamics, constraint: Constraint | None, stop: Callable[[Array], Array] | None) -> Dynamics:
+    """The same model with absorbing states: a particle stays where `stop` ends it, or grossly beyond the limit.
 
-    A model says nothing of what comes then, and may send particles to infinity.
+    No data tell a model what comes after such states, and it might send particles to infinity.
     """
     ends: list[Callable[[Array], Array]] = []
     if constraint is not None:
@@ -109,11 +109,11 @@ def held(dynamics: Dynamics, constraint: Constraint | None, stop: Callable[[Arra
     if not ends:
         return dynamics
 
-    def over(x: Array) -> Array:
+    def ended(x: Array) -> Array:
         return jnp.any(jnp.stack([end(x) for end in ends]))
 
     def still(x: Array, change: Prediction) -> Prediction:
-        return Prediction(*(jnp.where(over(x), 0.0, part) for part in change))
+        return Prediction(*(jnp.where(ended(x), 0.0, part) for part in change))
 
     def one(posterior: Params, draw: Params, x: Array, u: Array) -> Prediction:
         return still(x, dynamics.apply(posterior, draw, x, u))

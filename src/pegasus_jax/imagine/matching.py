@@ -42,17 +42,17 @@ def narrow(angles: tuple[int, ...]) -> Match:
 
 
 def either(condition: Array | None, yes: Callable[..., Array], no: Callable[..., Array]) -> Callable[..., Array]:
-    """The function that is `yes` where the condition holds and else `no`; without a condition, `no`.
+    """A function that is `yes` where the condition holds and `no` elsewhere; without a condition, `no`.
 
-    Both are computed, because a branch at each time step costs a GPU more than they do. The one that is not asked for
-    gets zeros: what it would make of a particle that has diverged reaches no gradient.
+    Both are computed, because a branch at each time step costs a GPU more than they do. The one that is not chosen is
+    given zeros: else a diverged particle could give it a gradient of NaN.
     """
     if condition is None:
         return no
 
     def chosen(*arguments: Array) -> Array:
-        asked, other = ([jnp.where(c, a, 0) for a in arguments] for c in (condition, ~condition))
-        return jnp.where(condition, yes(*asked), no(*other))
+        of_yes, of_no = ([jnp.where(c, a, 0) for a in arguments] for c in (condition, ~condition))
+        return jnp.where(condition, yes(*of_yes), no(*of_no))
 
     return chosen
 

@@ -39,9 +39,9 @@ def rollout(
 
     Each particle keeps one draw of the model and one of the policy along its whole trajectory. `match`,
     such as `matching.match` or `matching.keep`, makes the particles of the next step of x [K, D] and of z [K, D] from
-    the standard normal distribution. No gradient flows through the predicted noise. With a `limit`, none goes back
-    through a particle's state that is longer than that. What the policy remembers is of what it observed, noise
-    included.
+    the standard normal distribution. No gradient flows through the predicted noise. With a `limit`, a particle's
+    gradient is dropped at a state where it is longer than that (`limited`). The policy's memory holds what it observed,
+    noise included.
 
     Raises ValueError, while it is traced, where shapes do not agree; the message names the argument.
     """
@@ -53,21 +53,21 @@ def rollout(
     start, states = scenarios.start, scenarios.sensor.shape[-1]
 
     def step(carry: tuple[Array, Array], draws: tuple[Array, ...]) -> tuple[tuple[Array, Array], tuple]:
-        state, seeing = carry
+        state, obs_noise = carry
         sensor, redraw = draws
         if limit is not None:
             state = limited(state, limit)
         x, m = recall.split(state, states)
-        o = x + noise.policy * seeing
+        o = x + noise.policy * obs_noise
         u = act(policy_params, scenarios.policy, see(m, o))
         check_shape("what policy.apply returns for K particles", u, (len(x), None), "[K, U]")
         change = predict(posterior, scenarios.dynamics, x, given(m, u))
         check_prediction("dynamics.apply returns for K particles", change, x.shape, "[K, D]")
         std = jax.lax.stop_gradient(change.std)
-        blur = std * sensor
-        after = match(recall.join(x + change.mean + noise.state * blur, advance(m, o, u)), redraw)
-        seeing = blur if noise.sensors is None else noise.sensors * sensor
-        return (after, seeing), (after, u, std)
+        drawn = std * sensor
+        after = match(recall.join(x + change.mean + noise.state * drawn, advance(m, o, u)), redraw)
+        obs_noise = drawn if noise.sensors is None else noise.sensors * sensor
+        return (after, obs_noise), (after, u, std)
 
     draws = (scenarios.sensor, scenarios.match)
     unroll = UNROLL.get(jax.default_backend(), 1)
@@ -77,17 +77,17 @@ def rollout(
 
 
 def limited(x: Array, limit: Array | float) -> Array:
-    """x [K, D] itself, whose gradient is dropped in the rows where it is longer than `limit`, [] or [D], or not finite.
+    """x [K, D] itself; a row's gradient is dropped where it is longer than `limit`, [] or [D], or not finite.
 
-    On a plant that is chaotic the gradient of one particle can be 1e9 times that of the others: summed up, it would
-    drown them, and shortened, its direction would still be one of chance. Without it a particle answers for the
-    steps up to where chaos sets in, and no further.
+    On a chaotic plant the gradient of one particle can be 1e9 times that of the others. In their sum it would drown
+    them, and clipped it would keep a random direction. Where it is dropped, the controls before that state answer only
+    for the costs up to it.
     """
 
-    def short(limit: Array, gradient: Array) -> tuple[Array, Array]:
+    def backward(limit: Array, gradient: Array) -> tuple[Array, Array]:
         square = jnp.sum((gradient / limit) ** 2, -1, keepdims=True)
         return jnp.where(square <= 1, gradient, 0.0), jnp.zeros_like(limit)  # NaN is not
 
     same = jax.custom_vjp(lambda x, limit: x)
-    same.defvjp(lambda x, limit: (x, limit), short)
+    same.defvjp(lambda x, limit: (x, limit), backward)
     return same(x, jnp.asarray(limit, x.dtype))  # type: ignore[return-value]

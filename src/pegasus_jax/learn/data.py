@@ -24,10 +24,10 @@ def empty(capacity: int, states: int, controls: int, memory: int = 0) -> Dataset
 
 
 def add(data: Dataset, trajectory: Trajectory, angles: tuple[int, ...], memory: Array | None = None) -> Dataset:
-    """The data set with the transitions of an episode behind it (Alg. 1 line 4), and what was remembered [H+1, M].
+    """The data set with the transitions of an episode appended (Alg. 1 line 4), and the `memory` along it [H+1, M].
 
-    Only its rows that took place and for which there is room, behind what stays: the caller sizes a data set for the
-    whole run (trials x horizon). Raises ValueError for an episode of other widths.
+    Rows that did not take place are left out, and so are rows beyond the capacity: the caller makes room for the whole
+    run (trials x horizon). Raises ValueError for an episode of other widths.
     """
     check_trajectory(trajectory, data.x.shape[1], data.u.shape[1])
     horizon, capacity = trajectory.u.shape[0], data.x.shape[0]

@@ -35,8 +35,8 @@ def fit(
 ) -> tuple[TrainState, FitInfo]:
     """`steps` updates of the model's parameters, each on `batch_size` rows of the [N, D] in use (Alg. 1 line 5).
 
-    `optimizer` is any of optax, and `learner.optimizer` its state, `optimizer.init(params)`. A loss or a
-    gradient that is not finite changes neither. An optimizer that searches along a line gets the loss of the same rows
+    `optimizer` is any of optax, and `learner.optimizer` its state, `optimizer.init(params)`. An update is skipped where
+    the loss or its gradient is not finite. A line search evaluates the loss of the same rows
     and noise. Raises ValueError for data of other shapes than a `Dataset` has, and for a batch of no rows.
     """
     size("batch_size", batch_size)
@@ -70,7 +70,7 @@ def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
 
 
 def minibatches(dynamics: Dynamics, optimizer: optax.GradientTransformation, *, batch_size: int) -> ModelLearner:
-    """The fitter that takes `optimizer`'s steps on minibatches; each fit goes on with the moments of the one before.
+    """The fitter that steps `optimizer` on minibatches; each fit goes on with the optimizer state of the one before.
 
     Raises ConfigError for a `batch_size` [rows] below 1, or no whole number.
     """

@@ -35,10 +35,10 @@ def gradient_search(
 ) -> tuple[TrainState, SearchInfo]:
     """Alg. 3 as printed: `steps` updates along the gradient of `objective` under the scenarios of each iteration.
 
-    The learner is policy parameters and `optimizer.init` of them. `optimizer` has the clip of lines 17 and 18 in it:
-    optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-3)). Where the objective or its gradient is not finite, an
-    update changes nothing. The information has an entry for each of the N steps, [N]. With `first` they go on with a
-    search of which so many are done. A trial also tells its searcher `earlier`, `fresh` and `works`: of no use here.
+    The learner holds policy parameters and `optimizer.init` of them. `optimizer` includes the clip of lines 17 and 18:
+    optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-3)). An update is skipped where the objective or its
+    gradient is not finite. Arrays of the information have an entry a step, [N]. `first` iterations of the search are
+    done already. The other arguments that a trial gives its searcher, `earlier`, `fresh` and `works`, are ignored.
     """
 
     def step(carry: tuple[TrainState, Scenarios], i: Array) -> tuple[tuple[TrainState, Scenarios], SearchInfo]:

@@ -1,4 +1,4 @@
-"""Several policies searched side by side. The best goes on: to the plant, and where they do not last, alone."""
+"""Several policies searched side by side, of which the best runs on the plant."""
 
 from collections.abc import Callable
 from typing import Any
@@ -19,15 +19,15 @@ def best_of(
     lasting: bool = False,
     judge: Callable[[Key, Params, Params], Array] | None = None,
 ) -> PolicyOptimizer:
-    """The searcher that searches from `num_starts` policies under the same scenarios, all of them until the trial ends.
+    """The searcher that runs `searcher` from `num_starts` policies side by side, under the same scenarios.
 
-    The first is the policy it is given, the others are the first of `fresh` at iteration 0 of each trial; or of the
-    first search where they are `lasting`, and then each goes on from trial to trial, whichever is the best. What
-    `searcher` keeps from search to search, such as a constraint's multiplier, is a lasting member's own; the others
-    begin with what the given policy's member knows. The learner's parameters are always those of the member with the
-    lowest mean objective over the last `window` iterations, or as many as there were; or with the lowest number of
-    `judge(key, members' parameters, posterior)` [num_starts], where objectives cannot be compared: each counts a
-    constraint by its own multiplier. Its optimizer is all members: a `TrainState` [num_starts, ...].
+    At iteration 0 of each trial member 0 begins with the given policy, the others with the first of `fresh`. `lasting`
+    members begin like that in the first search only, and then each goes on from trial to trial. What `searcher` keeps
+    from search to search, such as a constraint's multiplier, a lasting member keeps for itself; the others begin with
+    that of the member whose policy is given. The learner's parameters are those of the best member: of the lowest mean
+    objective over the last `window` iterations, or as many as there were. Where members count a constraint by
+    multipliers of their own, objectives cannot be compared: then of the lowest `judge(key, members' parameters,
+    posterior)` [num_starts]. The learner's optimizer state is all members: a `TrainState` [num_starts, ...].
     """
 
     def init(params: Params) -> TrainState:
@@ -47,7 +47,7 @@ def best_of(
         def gathered() -> TrainState:
             several = lambda own, rest: jnp.concatenate([own[None], rest[: num_starts - 1]])  # noqa: E731
             members = jax.tree.map(several, learner.params, fresh)
-            last = place_of(learner.params, learner.optimizer.params)
+            last = index_of(learner.params, learner.optimizer.params)
             known = jax.tree.map(lambda leaf: jnp.stack([leaf[last]] * num_starts), learner.optimizer.optimizer)
             return TrainState(members, known)
 
@@ -72,10 +72,10 @@ def best_of(
     return PolicyOptimizer(init, run)
 
 
-def place_of(params: Params, members: Params) -> Array:
-    """[] the first of the members [N, ...] with these parameters.
+def index_of(params: Params, members: Params) -> Array:
+    """[] the index of the first of the members [N, ...] that has these parameters.
 
-    0 where there is none: a policy that went on as it was before a search is the one that member 0 began with.
+    0 where none has: then the policy from before the search went on, with which member 0 had begun.
     """
     same = jax.tree.map(lambda own, all_of: jnp.all((all_of == own).reshape(len(all_of), -1), 1), params, members)
     return jnp.argmax(jnp.all(jnp.stack(jax.tree.leaves(same)), 0))

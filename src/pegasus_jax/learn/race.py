@@ -20,15 +20,15 @@ class Leader(NamedTuple):
 
 
 def leader_of(table: SearchTable, params: Params, moments: Any) -> Leader | None:
-    """What is in the leader's place before a race of the table; None for a table without a race."""
+    """A `Leader` for a table's search to begin with, replaced when its race begins; None for one without a race."""
     return Leader(params, moments, jnp.ones((), float)) if LEADER in table.candidate else None
 
 
 def candidate(row: SearchTable, learner: TrainState, fresh: Params | None) -> Params:
-    """The parameters that a row visits; `fresh` are two policies [2, ...] that know nothing, or None.
+    """The parameters that a row visits; `fresh` are two untrained policies [2, ...], or None.
 
-    The second of a race is the fresh one, too, where the given one works, so that another is to be found, or where the
-    last search found nothing better than it.
+    The second policy of a race is the given one. It is the second fresh one where the given one works already, or where
+    the last search found nothing better than it: then the race is to find another policy.
     """
     own, state = learner
     first, second = (own, own) if fresh is None else (jax.tree.map(lambda leaf, i=i: leaf[i], fresh) for i in range(2))
@@ -41,7 +41,7 @@ def candidate(row: SearchTable, learner: TrainState, fresh: Params | None) -> Pa
 
 
 def entered(row: SearchTable, learner: TrainState, optimizer: optax.GradientTransformation) -> TrainState:
-    """The learner with which a row begins: with the second policy of a race the first one is kept as its leader."""
+    """The learner at the start of a row: where a race's second policy begins, the first is stored as the leader."""
     params, state = learner
     if state.leader is None:
         return learner
@@ -52,7 +52,7 @@ def entered(row: SearchTable, learner: TrainState, optimizer: optax.GradientTran
 
 
 def returned(row: SearchTable, taken: Array, state: Any) -> Any:
-    """The state with the moments and the width of the leader, where its policy is taken."""
+    """The state with the leader's optimizer state and widening, where the leader's policy is taken."""
     if state.leader is None:
         return state
     won, own = (row.candidate == LEADER) & taken, (state.optimizer, state.widening)

@@ -20,7 +20,7 @@ class Progress(NamedTuple):
 
 
 def unrefined() -> Progress:
-    """Of a search before its first round."""
+    """The progress of a search before its first round."""
     nothing, unknown = jnp.zeros((), float), jnp.asarray(jnp.inf, float)
     return Progress(nothing, nothing, nothing, unknown, unknown, jnp.zeros((), bool))
 
@@ -32,7 +32,7 @@ def after_row(progress: Progress, row: Any, value: Array) -> Progress:
     policy is expected to cost. A round has gained nothing where their mean is not lower than that of the round before
     by more than the standard error of the difference.
     """
-    counts = row.counts & jnp.isfinite(value)  # a step under bad numbers changes nothing
+    counts = row.counts & jnp.isfinite(value)  # a step that was skipped does not count
     counted = jnp.where(counts, value, 0.0)
     count, total = progress.count + counts, progress.total + counted
     squares = progress.squares + counted**2

@@ -11,7 +11,7 @@ from pegasus_jax.math.decay import half_cosine
 
 EVALUATE, STEP = range(2)  # what a row does with the candidate whose cost and gradient it computes
 CURRENT, FRESH, OTHER, LEADER, START, COARSE = range(6)  # which parameters it visits: see `SearchTable.candidate`
-RACED = 0.25  # of what comes before the refinement, which each policy of a race has: docs/decisions.md 0041
+RACED = 0.25  # of the iterations before the refinement, for each policy of a race: docs/decisions.md 0041
 REFINED = 0.03  # the step size at the end of a round of refinement, as a fraction of the search's
 JUDGED = 0.25  # the last part of a round, in which the steps are small, whose objectives say what it has gained
 
@@ -25,11 +25,11 @@ class SearchTable(NamedTuple):
     iteration: Any  # [R] the iteration that the row belongs to, 0..N-1: N iterations can be cut anywhere
     scenarios: Any  # [R] the iteration whose scenarios it is under: after the last step of a phase, the next one
     action: Any  # [R] STEP goes on from the candidate, along its gradient; EVALUATE compares costs
-    # [R] CURRENT: what the search has now. To evaluate one of the others may take it in place of CURRENT, evaluated in
-    # the row before. FRESH, a policy that knows nothing: if it costs no more, and always where the last search gained
-    # nothing or the given policy works. OTHER and LEADER, the second of a race and the first as it was (learn/race.py):
-    # LEADER if it costs less, or CURRENT's cost is NaN. START, what the search was given, and COARSE, what the
-    # refinement started from: if they cost no more, or a cost is NaN.
+    # [R] CURRENT: the search's own policy. A row that evaluates another one may put it in the place of CURRENT, which
+    # the row before has evaluated. FRESH, an untrained policy: if it costs no more, and always where the last search
+    # gained nothing or the given policy works. OTHER and LEADER, the second policy of a race and the first as it was
+    # (learn/race.py): LEADER if it costs less, or CURRENT's cost is NaN. START, what the search was given, and COARSE,
+    # what the refinement started from: if they cost no more, or a cost is NaN.
     candidate: Any
     refine: Any  # [R] whether the objective is the refining one
     counts: Any  # [R] whether a step's objective counts in the mean of its round of refinement
@@ -65,21 +65,21 @@ def search_table(
     """
     choice("init", init, INITS)
     bounds = [] if refine is None else sorted({*np.atleast_1d(refine).tolist(), steps})
-    heat = int(RACED * bounds[0]) if bounds and init == "raced" else 0
-    compares = init == "better" or (init == "raced" and not heat)
+    race = int(RACED * bounds[0]) if bounds and init == "raced" else 0  # iterations of each policy of a race
+    compares = init == "better" or (init == "raced" and not race)
     rows = [(0, 0, EVALUATE, CURRENT), (0, 0, EVALUATE, FRESH)] if compares else []
     for i in range(steps):
-        begins = OTHER if heat and i == heat else FRESH if i == 0 and (heat or init == "fresh") else CURRENT
+        begins = OTHER if race and i == race else FRESH if i == 0 and (race or init == "fresh") else CURRENT
         rows += [(i, i, STEP, begins)]
-        if heat and i + 1 == 2 * heat:
+        if race and i + 1 == 2 * race:
             rows += [(i, i + 1, EVALUATE, CURRENT), (i, i + 1, EVALUATE, LEADER)]
         if i + 1 in bounds:
             given = START if i + 1 == bounds[0] else COARSE
             rows += [(i, i + 1, EVALUATE, CURRENT), (i, i + 1, EVALUATE, given)]
     iteration, scenarios, action, candidate = np.array(rows, np.int32).reshape(-1, 4).T
     number = np.arange(anneal_trials + 1 if anneal_trials > 1 else 1)[:, None]
-    i = number * steps + scenarios - heat * (iteration >= heat)  # [T, R] counted over all searches, a race once
-    coarse = (bounds[0] if bounds else anneal_trials * steps) - heat
+    i = number * steps + scenarios - race * (iteration >= race)  # [T, R] over all searches; one policy of a race counts
+    coarse = (bounds[0] if bounds else anneal_trials * steps) - race
     width = cost_width_start ** np.maximum(0, 1 - i / (coarse / 2)) if coarse else np.ones(i.shape)
     refines = scenarios >= (bounds[0] if bounds else steps + 1)
     passed = np.interp(scenarios, bounds or [0], range(len(bounds) or 1)) % 1  # [R] of a round

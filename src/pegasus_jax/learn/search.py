@@ -24,7 +24,7 @@ class Problem(NamedTuple):
     sampler: Sampler
     optimizer: optax.GradientTransformation  # any of optax
     table: SearchTable
-    works: Array | bool = False  # [] whether the policy that a search is given works; 2: another has failed since
+    works: Array | bool = False  # [] whether the given policy works; 2: the policy that replaced it has failed since
     reset_optimizer: bool = True  # whether each search starts with a new optimizer state
     # What a constraint makes of its multiplier; None: there is none. With it the objective's last argument is the
     # multiplier, and it returns (value, probability).
@@ -53,26 +53,26 @@ def search(
 ) -> tuple[TrainState, SearchInfo]:
     """The rows of iterations first .. first + steps - 1 of the problem's table, in the search after `earlier` others.
 
-    A search that only refines (`only_refines`) begins at the first that does, as 0, and one ends with a round of
-    refinement that has gained nothing (learn/rounds.py); what it lacks is NaN in the info [n]. One call of n steps and
-    two of n/2, the second with first=n/2, do the same. `fresh` are policies [2, ...] that know nothing, for
-    a table that asks for them. Raises ValueError for more iterations than the table has, or no fresh policy.
+    A search that only refines (`only_refines`) begins at the first refining iteration and counts it as 0. A search ends
+    early after a round of refinement that has gained nothing (learn/rounds.py): the info [n] is NaN where no iteration
+    was done. One call of n steps and two of n/2, the second with first=n/2, do the same. `fresh` are untrained policies
+    [2, ...], for a table that asks for them. Raises ValueError for too many iterations, or where `fresh` is missing.
     """
     table, sampler, begin = problem.table, problem.sampler, first_rows(problem.table)
     known = int(first) if isinstance(first, int | np.integer) else 0
     if known + steps > (most := len(begin) - 1):
         raise ValueError(f"first={known}, steps={steps}: the table of this search has {most} iterations")
-    if (asks := FRESH in table.candidate) and fresh is None:  # one that no row asks for is not drawn
+    if (asks := FRESH in table.candidate) and fresh is None:
         raise ValueError("the table has a fresh policy as a candidate, and fresh= is None; expected its parameters")
     rows = of_search(table, earlier)
     learner = optax.tree.where(jnp.asarray(first) == 0, renewed(problem, learner), learner)
-    # Where nothing refines nothing is skipped. Without a word of what works all begin at 0: seeds side by side then
-    # have one number, and one loop.
+    # Without `works`, or without a refinement, nothing is skipped: seeds side by side then share one offset, and a loop
+    # of one length.
     before = int(np.sum(~table.refine[begin[:-1]]))
     skips = problem.works is not False and before < most and only_refines(table, learner.optimizer.worked)
     offset = first + jnp.where(skips, jnp.int32(before), 0)
     row, end = (jnp.asarray(begin)[jnp.minimum(i, most)] for i in (offset, offset + steps))
-    count = steps if len(table.action) == most else end - row  # a known number is quicker on a GPU
+    count = steps if len(table.action) == most else end - row  # a static length is quicker on a GPU
 
     def going(loop: tuple) -> Array:  # seeds side by side have one condition where no round ends a search
         return (loop[0] < count) & ~loop[1].optimizer.progress.over if table.ends.any() else loop[0] < count

@@ -1,4 +1,4 @@
-"""Which policy a run goes on with after an episode: one that worked is not forgotten for one that does not."""
+"""Which policy a run goes on with after an episode: a policy that worked comes back if its replacement fails."""
 
 import jax.numpy as jnp
 import optax
@@ -7,13 +7,13 @@ from pegasus_jax.types import Array, RunState
 
 
 def after_episode(state: RunState) -> RunState:
-    """The run after an episode of its policy: one that works is remembered, one that fails gives way to it, once.
+    """The run after an episode: a policy that worked is remembered, and comes back once if the next policy fails.
 
-    A policy from a fresh start may work in imagination only, where the model does not know what it does. The episode
-    has taught the model that; the one before it is still a policy that works. If that fails in its own next episode, or
-    the next one that replaces it fails too, it was luck, and nothing is remembered: docs/decisions.md 0021.
+    A policy from a fresh start may work in imagination only, where the model is wrong. The episode has taught that to
+    the model, and the policy before it still works. If that one fails in its own next episode, or its next replacement
+    fails too, it worked by luck, and nothing is remembered any more: docs/decisions.md 0021.
     """
-    learned = state.policy_trial > 0  # and no random controls
+    learned = state.policy_trial > 0  # a policy ran, and not random controls
     works = state.succeeded & learned
     back = learned & ~state.succeeded & (state.working_trial > 0) & (state.working_trial != state.policy_trial)
     params = optax.tree.where(back, state.working, state.policy.params)

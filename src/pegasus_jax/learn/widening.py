@@ -1,4 +1,4 @@
-"""How much wider than its table says a search holds a cost that is too flat to be followed: docs/decisions.md 0034."""
+"""How much wider than its table says a search makes a cost that is too flat to be followed: docs/decisions.md 0034."""
 
 import jax.numpy as jnp
 
@@ -11,16 +11,16 @@ MOST = 3.0  # of the factor
 
 
 def holding(table: SearchTable) -> SearchTable:
-    """The table, in which every step before a refinement holds the cost wider where it is too flat."""
+    """The table, in which every step before a refinement may widen a cost that is too flat."""
     return table._replace(holds=(table.action == STEP) & ~table.refine)
 
 
 def widened(row: SearchTable, widening: Array) -> SearchTable:
-    """A row, whose cost is wider by the factor `widening` [] where the row holds it."""
+    """A row, whose cost is wider by the factor `widening` [] where the row may widen it."""
     return row._replace(cost_width=row.cost_width * jnp.where(row.holds, widening, 1.0))
 
 
 def after_step(widening: Array, row: SearchTable, value: Array) -> Array:
-    """The factor [] after a row whose objective was `value` []: it grows while nothing is seen, and falls back to 1."""
+    """The factor [] after a row whose objective was `value` []: it grows while the cost is flat, else falls to 1."""
     moved = jnp.where(value > SEEN, widening * RATE, widening / RATE)
     return jnp.where(row.holds, jnp.clip(moved, 1.0, MOST), widening)
