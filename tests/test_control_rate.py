@@ -103,7 +103,7 @@ def test_one_rate_for_all_controls_or_one_each():
     names, low = ("left", "right"), np.array([-1.0, 0.5])
     task = cart()._replace(control_names=names, control_low=low, control_high=np.ones(2))
     for rates, most in (((2.0,), [0.6, 0.6]), ((2.0, 1.0), [0.6, 0.3])):
-        slow = tasks.whole(remembering(tiny(control_rate=rates), task))
+        slow = tasks.augmented(remembering(tiny(control_rate=rates), task))
         policy = rate_limited(Policy(None, None, lambda *_: jnp.array([1.0, 1.0]), memory=slow.memory), slow)  # type: ignore[arg-type]
         m = memory.begin(slow.memory, jax.random.key(0), jnp.zeros(2))
         see, _, advance = memory.steps(slow.memory)

@@ -51,7 +51,7 @@ def sensing(name):
     config = tiny(**KINDS[name])
     task = cart(H)._replace(sensor_std=np.zeros(2))
     task = task if name != "history" else task._replace(cost=task.cost._replace(of_state=lambda x: x[0] ** 2))
-    return config, tasks.whole(remembering(config, sensed(task, config.sensors)))
+    return config, tasks.augmented(remembering(config, sensed(task, config.sensors)))
 
 
 def exact(task):

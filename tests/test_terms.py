@@ -101,7 +101,7 @@ def test_a_cost_that_nobody_can_serve_is_one_line(cost, said):
 )
 def test_settings_that_cannot_be_are_one_line(words, said):
     with pytest.raises(ConfigError, match=said) as caught:
-        tasks.whole(tasks.of_config(parse(task="cartpole", **words)))
+        tasks.augmented(tasks.of_config(parse(task="cartpole", **words)))
     assert "\n" not in str(caught.value)
 
 
@@ -184,7 +184,7 @@ def test_the_policy_sees_goal_and_reference_in_units_of_their_size(run):
 
 def test_goals_of_episodes_differ_and_are_those_of_the_limits():
     config = parse(task="cartpole", cost=lambda x, goal: x[0] - goal[0], goal_low="[1,2]", goal_high="[3,2.5]")
-    remembered = tasks.whole(tasks.of_config(config)).memory
+    remembered = tasks.augmented(tasks.of_config(config)).memory
     keys = jax.random.split(jax.random.key(0), 30)
     drawn = np.asarray(jax.vmap(lambda key: memory.begin(remembered, key, jnp.zeros(4)))(keys))
     assert drawn.shape == (30, 2)
@@ -195,7 +195,7 @@ def test_goals_of_episodes_differ_and_are_those_of_the_limits():
 def test_what_has_no_terms_is_as_it_was():
     """No memory, and the very functions of before."""
     cost = Cost(lambda x: x[0])
-    task = tasks.whole(cart()._replace(cost=cost))
+    task = tasks.augmented(cart()._replace(cost=cost))
     assert task.memory.names == ()
     assert task.cost is cost
 
@@ -205,7 +205,7 @@ def test_what_has_no_terms_is_as_it_was():
 
 def test_the_expectation_of_a_cost_of_controls_is_that_of_their_gaussian(x64):
     """A quadratic cost of x and u, whose expectation is known: by 512 nodes, from matched particles."""
-    task = terms.whole(cart()._replace(cost=Cost(lambda x, u, previous_u: (x[0] + u[0] - 2 * previous_u[0]) ** 2)))
+    task = terms.augmented(cart()._replace(cost=Cost(lambda x, u, previous_u: (x[0] + u[0] - 2 * previous_u[0]) ** 2)))
     assert task.memory.matched
     spread = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0.5, 0, 1, 0], [-0.3, 0, 0.2, 1]])
     particles = jax.random.normal(jax.random.key(0), (100, 4)) @ spread.T + jnp.array([0.1, 0, 0.2, -0.3])
@@ -222,7 +222,7 @@ def test_a_closed_form_of_the_state_alone_cannot_serve_a_cost_of_controls():
 
 def test_goals_switch_matching_off_and_a_reference_does_not():
     def task(**words):
-        return tasks.whole(tasks.of_config(parse(task="cartpole", **words)))
+        return tasks.augmented(tasks.of_config(parse(task="cartpole", **words)))
 
     assert not task(cost=lambda x, goal: goal[0], goals=goals).memory.matched
     assert task(cost=lambda x, reference, t: t, reference=sine).memory.matched
@@ -345,8 +345,8 @@ def test_a_folder_keeps_the_terms_the_reference_and_the_size_of_goals(run):
     kept = facts.of_task(task)
     assert kept["terms"] == list(terms.TERMS)
     read = facts.to_task(kept, "run.json")
-    assert facts.difference(kept, facts.of_task(tasks.whole(read)), pairs=True) is None
-    restored = tasks.whole(read)
+    assert facts.difference(kept, facts.of_task(tasks.augmented(read)), pairs=True) is None
+    restored = tasks.augmented(read)
     assert restored.memory.names == task.memory.names
     assert restored.memory.shown == task.memory.shown
     np.testing.assert_allclose(restored.memory.shown_units, task.memory.shown_units, rtol=1e-5)
@@ -358,7 +358,7 @@ def test_a_folder_keeps_the_terms_the_reference_and_the_size_of_goals(run):
 def test_the_controller_is_given_goals_and_references(tmp_path):
     """Beside the policy itself, which is given by hand what the controller remembers."""
     words = dict(cost=price, reference=sine, goals=goals, **SMALL)
-    task = tasks.whole(tasks.of_config(parse(task="cartpole", **words)))
+    task = tasks.augmented(tasks.of_config(parse(task="cartpole", **words)))
     plain = {name.replace(".", "__"): value for name, value in SMALL.items() if name not in ("model", "trials")}
     run = a_run(tmp_path / "run", made=task, **plain)
     control = controller(run, trial="last")

@@ -22,7 +22,7 @@ class Dataset(NamedTuple):
     u: Array  # [N, V] control as the model is given it; V = U unless the task's memory or hindsight says otherwise
     y: Array  # [N, D] change of state; differences of angles are wrapped to [-pi, pi]
     size: Array  # [] int32, rows in use; the rows beyond are zero
-    memory: Array | None = None  # [N, M] what was remembered there; None: the task has no memory
+    memory: Array | None = None  # [N, M] the memory in these rows; None: the task has no memory
 
 
 class Batch(NamedTuple):
@@ -34,13 +34,13 @@ class Batch(NamedTuple):
 
 
 class Trajectory(NamedTuple):
-    """One episode on a plant, as the controller saw it. One that ended early has rows that say nothing behind it."""
+    """One episode on a plant, as the controller saw it. Rows after an early end have no meaning."""
 
     x: Array  # [H+1, D] observed state
     u: Array  # [H, U] control
     cost: Array  # [H] cost of the states 1..H, without sensor noise where the plant can tell
     length: Array | None = None  # [] int32, the control periods that took place; None: all H
-    memory: Array | None = None  # [M] at the start; the rest follows from x and u. None: none, or nothing was drawn
+    memory: Array | None = None  # [M] at the start; x and u tell the rest. None: no memory, or nothing was drawn for it
 
 
 class Prediction(NamedTuple):
@@ -96,11 +96,11 @@ class Dynamics(NamedTuple):
     """A distribution over functions (x, u) -> change of x, learned from data."""
 
     init: Callable[[Key], Params]
-    prepare: Callable[[Dataset], Any]  # what the loss needs to know of the data set as a whole
+    prepare: Callable[[Dataset], Any]  # what the loss needs of the whole data set, such as its scaling
     loss: Callable[[Params, Key, Batch, Any], Array]  # (params, key, batch, prepare(data)) -> scalar
     posterior: Callable[[Params, Dataset], Any]  # -> posterior, all that a rollout needs
     sample: Callable[[Key, Any], Params]  # (key, posterior) -> draw: one function, one particle's w^(k)
-    # (posterior, draw, x [D], u [U]); one that is `Vectorized` answers for K particles in a way of its own
+    # (posterior, draw, x [D], u [U]); a `Vectorized` function also has an implementation for K particles at once
     apply: Callable[[Any, Params, Array, Array], Prediction]
     # (posterior, mean [F + U], cov of (encoded state, control)) -> gaussian.Image of the change; None: not known
     moments: Callable[[Any, Array, Array], Any] | None = None
@@ -123,16 +123,16 @@ class Memory(NamedTuple):
     shown_units: tuple[float, ...] = ()  # how large each of these is, as a network counts it; (): 1
     # (m, u [U]) -> what the model is given in place of the control u [V], such as one of some periods ago; None: u
     applied: Callable[[Any, Array], Array] | None = None
-    # Whether m may be redrawn with x from their common Gaussian. Not what an episode keeps, and x depends on: a goal.
+    # Whether moment matching may redraw m together with x. False for what stays the same in an episode, as a goal.
     matched: bool = True
     measured: tuple[int, ...] | None = None  # the entries of o that are looked at; None: all
 
 
 class Hindsight(NamedTuple):
-    """How the states of an episode are known afterwards, better than while it ran: what a model learns."""
+    """Better estimates of an episode's states, made after it has ended: the model learns from these."""
 
     # (observations [H+1, D], the last row that took place, controls as the model is given them [H, V]) -> (states
-    # [H+1, D], more controls [H, W]: what the fit is told beside them, and a rollout is not)
+    # [H+1, D], more columns of the controls [H, W], which the fit is given and a rollout is not)
     states: Callable[[Array, Array, Array], tuple[Array, Array]]
     more: int  # W
 
@@ -154,7 +154,7 @@ class Policy(NamedTuple):
 
 
 class Cost(NamedTuple):
-    """What a search is to make small: a differentiable function of one state, in [0, 1]. x is x' [D + M] in a task."""
+    """What a search minimizes: a differentiable function of one state, in [0, 1]. x is x' [D + M] in a task."""
 
     of_state: Callable[[Array], Array]  # x [D] -> scalar
     # (mean [D], cov [D, D]) -> E[cost] of a Gaussian state; None: not in closed form, but by costs.expected_by_nodes
@@ -181,8 +181,8 @@ class PolicyOptimizer(NamedTuple):
 
     init: Callable[[Params], Any]  # parameters -> the optimizer's state
     # (key, learner, posterior, steps=, first=, earlier=, fresh=) -> (learner, SearchInfo): iterations first .. first +
-    # steps - 1 of the search after `earlier` others; `fresh` are of some that know nothing [2, ...], or more. One that
-    # refines takes works=, whether the given policy's newest episode succeeded; 2: and its successor has failed since
+    # steps - 1 of the search after `earlier` others; `fresh` are untrained policies [2, ...], or more. One that refines
+    # takes works=, whether the given policy's newest episode succeeded; 2: and the policy after it has failed since
     run: Callable[..., tuple[TrainState, Any]]
 
 
@@ -196,5 +196,5 @@ class RunState(NamedTuple):
     trial: Array  # [] int32, episodes added so far
     policy_trial: Array  # [] int32, the trial after which this policy was learned; 0: it has learned nothing yet
     succeeded: Array  # [] bool, whether the newest episode of this policy did
-    working: Params  # of a policy whose newest episode succeeded, to go back to: learn/successor.py
+    working: Params  # of the policy to go back to, whose newest episode succeeded: learn/successor.py
     working_trial: Array  # [] int32, the trial after which that was learned; 0: there is none

@@ -105,7 +105,7 @@ def assembled(config: settings.Config, task: Task, mesh: Mesh | None, logged: in
     task = checked(task._replace(cost=as_cost(task.cost)))
     try_task(task)
     task = remembering(config, task)
-    task = tasks.whole(task, None if cost is None else as_cost(cost))
+    task = tasks.augmented(task, None if cost is None else as_cost(cost))
     if dynamics is not None:
         try_dynamics(dynamics, task, capacity(config, task, logged), fits=fitter is None)
     if policy is not None:

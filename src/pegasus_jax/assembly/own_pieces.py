@@ -27,7 +27,7 @@ from pegasus_jax.types import Batch, Dynamics, Key, Policy
 def try_task(task: Task) -> None:
     """Raises ConfigError, in one line, for a function of a task that does not answer as `Task` says.
 
-    A task that is whole already has functions of x' [D + M].
+    The functions of a task that is augmented already are of x' [D + M].
     """
     more = 0 if task.terms is None else len(task.memory.names)
     states, arrays = len(task.state_names), jnp.zeros(()).dtype

@@ -74,8 +74,8 @@ def find(seen: np.ndarray, others: Sequence[int] = ()) -> Circles:
     square = np.asarray(seen, np.float64) ** 2
     found: list[tuple[int, ...]] = []
     for i, j in combinations(sorted(free), 2) if len(seen) >= SAMPLES else ():
-        round_ = np.abs(square[:, i] + square[:, j] - 1).max() < TOLERANCE and np.ptp(square[:, i]) > SPREAD
-        if round_ and {i, j} <= free:
+        on_circle = np.abs(square[:, i] + square[:, j] - 1).max() < TOLERANCE and np.ptp(square[:, i]) > SPREAD
+        if on_circle and {i, j} <= free:
             found.append((i, j))
             free -= {i, j}
     return tuple(found)

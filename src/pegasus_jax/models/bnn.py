@@ -54,7 +54,7 @@ def bnn(
 
     def prepare(data: Dataset) -> Scaling:
         inputs = whitener(inputs_of(data.x, data.u), data.size)
-        # An input that has never varied is not seen: a start a little beside it would be thousands of units away.
+        # An input that has never varied is ignored: scaled by rounding errors, a small change of it would be thousands.
         inputs = inputs._replace(inverse=jnp.where(varied(inputs), inputs.inverse, 0))
         return Scaling(inputs, whitener(data.y, data.size), data.size)
 

@@ -1,4 +1,4 @@
-"""How honest a model is about its errors, measured along an episode that it has not seen."""
+"""How well a model predicts the size of its errors, measured along an episode that it has not seen."""
 
 import jax
 import jax.numpy as jnp
@@ -29,7 +29,7 @@ def calibration(
     rows = jnp.arange(len(error))[:, None]
     took_place = rows < (len(error) if trajectory.length is None else trajectory.length)
     ratio = error**2 / variance
-    # Else the model predicts NaN, which is no row that is left out; nor is 0 / 0, of what is known exactly.
+    # A prediction of NaN gives NaN, while 0 / 0, of what is known exactly, is left out of the median like absent rows.
     known = ~jnp.any((jnp.isnan(error) | jnp.isnan(variance)) & took_place)
     return jnp.sqrt(jnp.nanmedian(jnp.where(took_place & known, ratio, jnp.nan))) / HALF
 

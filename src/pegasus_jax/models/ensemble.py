@@ -11,7 +11,7 @@ from pegasus_jax.vectorized import Vectorized
 
 
 class Dealt(NamedTuple):
-    """Draws of K particles, of which the k-th follows member k modulo `members`: whose it is, its place tells."""
+    """Draws of K particles: the k-th particle follows member k modulo `members`."""
 
     chosen: Array  # [K, members], 1 where a particle follows that member
     own: Params  # [K, ...] its draw of that member
@@ -67,7 +67,7 @@ def ensemble(member: Dynamics, members: int) -> Dynamics:
         if not isinstance(draws, Dealt):
             return jax.vmap(apply, (None, 0, 0, 0))(posterior, draws, x, u)
         rounds = -(-len(x) // members)
-        filled = jnp.arange(rounds * members) % len(x)  # a last round that is not whole begins again, for nobody
+        filled = jnp.arange(rounds * members) % len(x)  # the last round is filled up, and its surplus is dropped
 
         def split(rows: Array) -> Array:
             whole = rows if len(filled) == len(x) else rows[filled]

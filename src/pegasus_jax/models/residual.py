@@ -21,7 +21,7 @@ from pegasus_jax.types import (
 from pegasus_jax.vectorized import Vectorized, for_particles
 
 Simulate = Callable[[Array, Array], Array]  # (x [D], u [U]) -> x [D] one control period later
-FURTHEST = 2.0  # how far what is added may go beyond all that was seen of it, as a factor
+FURTHEST = 2.0  # the most that is added, as a factor of the largest difference in the data
 
 
 class Posterior(NamedTuple):
@@ -32,15 +32,15 @@ class Posterior(NamedTuple):
 
 
 def residual(learned: Dynamics, simulate: Simulate, *, angles: tuple[int, ...]) -> Dynamics:
-    """A model whose mean is the simulator's change of state, and what `learned` adds to it; its noise is `learned`'s.
+    """A model whose mean is the simulator's change of state plus what `learned` adds to it; its noise is `learned`'s.
 
-    `learned` is a model of U + D controls: it is also told the simulator's change of state [D], so that it need not
-    learn again what the simulator knows where that is wrong by a factor. What it adds is never more than FURTHEST times
-    the largest difference in the data, so nothing before there are data: it smoothly ends there, else a network that
-    extrapolates could bring imagined states to where the simulator diverges. Gradients flow through both parts.
+    `learned` is a model of U + D controls: it is also given the simulator's change of state [D], so that it need not
+    learn that again where the simulator is wrong by a factor. What it adds saturates smoothly at FURTHEST times the
+    largest difference in the data, so it is nothing before there are data: else a network that extrapolates could send
+    imagined states to where the simulator diverges. Gradients flow through both parts.
     """
 
-    def told(x: Array, u: Array) -> tuple[Array, Array]:
+    def simulated(x: Array, u: Array) -> tuple[Array, Array]:
         change = difference(simulate(x, u), x, angles)
         return change, jnp.concatenate([u, change])
 
@@ -57,12 +57,12 @@ def residual(learned: Dynamics, simulate: Simulate, *, angles: tuple[int, ...]) 
         return Prediction(change + given.limit * jnp.tanh(added.mean / given.limit), added.std)
 
     def one(given: Posterior, draw: Params, x: Array, u: Array) -> Prediction:
-        change, seen = told(x, u)
-        return total(given, change, learned.apply(given.learned, draw, x, seen))
+        change, inputs = simulated(x, u)
+        return total(given, change, learned.apply(given.learned, draw, x, inputs))
 
     def many(given: Posterior, draws: Params, x: Array, u: Array) -> Prediction:
-        change, seen = jax.vmap(told)(x, u)
-        return total(given, change, for_particles(learned.apply)(given.learned, draws, x, seen))
+        change, inputs = jax.vmap(simulated)(x, u)
+        return total(given, change, for_particles(learned.apply)(given.learned, draws, x, inputs))
 
     deal = learned.deal
     return Dynamics(
@@ -77,9 +77,9 @@ def residual(learned: Dynamics, simulate: Simulate, *, angles: tuple[int, ...]) 
 
 
 def differences(rows: Any, simulate: Simulate, angles: tuple[int, ...]) -> Any:
-    """Rows, a `Dataset` or a `Batch`, and what the simulator makes of them: u [U + D], y [D] as `learned` wants.
+    """The rows of a `Dataset` or a `Batch` as `learned` takes them: u [U + D] with the simulator's change of state.
 
-    y is by what the plant's change of state differs from the simulator's.
+    y [D] is the plant's change of state minus the simulator's.
     """
     change = difference(jax.vmap(simulate)(rows.x, rows.u), rows.x, angles)
     return rows._replace(u=jnp.concatenate([rows.u, change], -1), y=difference(rows.y, change, angles))

@@ -26,9 +26,9 @@ class Gaussian(NamedTuple):
 
 
 def corrected(model: Dynamics, *, rates: tuple[int, ...], inputs: int) -> Dynamics:
-    """The model, whose data's controls [N, inputs + 1] end with whether an episode begins in a row.
+    """The model for data whose controls [N, inputs + 1] have one more column: 1 where an episode begins.
 
-    While it is fitted, what the rates are to be corrected by follows: [N, 2 n], at a row's beginning and at its end.
+    In a fit, corrections of the rates follow behind it, [N, 2 n]: at a row's beginning and at its end.
     """
     place, n = np.array(rates), len(rates)
 
@@ -48,7 +48,7 @@ def corrected(model: Dynamics, *, rates: tuple[int, ...], inputs: int) -> Dynami
 
 
 def alternating(fitter: ModelLearner, draw: Callable[[Key, Params, Dataset, Array], Array], size: int) -> ModelLearner:
-    """The fitter of a model that is `corrected`, by corrections [N, `size`] that are drawn again after some updates.
+    """The fitter of a `corrected` model, whose corrections [N, `size`] are drawn again every `ROUND` updates or so.
 
     That is stochastic expectation maximization (Celeux and Diebolt, 1985): states are drawn as the model and what was
     measured have them, and the model is fitted to the states, so that its noise stays that of the plant.
@@ -92,7 +92,7 @@ def draw_rates(
     inputs: int,
     dt: float,
 ) -> Array:
-    """By how much the rates of the data [N, 2 n] differ from those drawn as the model and the positions have them.
+    """Corrections [N, 2 n] of the rates in the data: to rates drawn given the model and the measured positions.
 
     An extended Kalman filter along each episode, linear around the rates corrected as `before`, and a draw of its
     states from the last one to the first (Rauch, Tung and Striebel). Half of the variance that the model has for a
@@ -117,10 +117,10 @@ def draw_rates(
     x, y = data.x.at[:, place].add(begun), data.y.at[:, place].add(ended - begun)
     changes = jax.vmap(lambda x, u: change(x, u)[0])(x, data.u[:, :inputs])
     slopes, (noise, unknown) = jax.vmap(jax.jacfwd(change, has_aux=True))(x, data.u[:, :inputs])
-    onward, off = jnp.eye(states) + slopes, difference(changes, y, angles)
+    transition, offset = jnp.eye(states) + slopes, difference(changes, y, angles)
     sensor = noise[:, measured] / 2
-    # A force that is not known moves the rates, and by half a period of it the positions.
-    moved = unknown.at[:, measured].set((dt / 2) ** 2 * unknown[:, place])
+    # Variances of the process noise. An unknown force moves the rates, and by half a period of it the positions.
+    process = unknown.at[:, measured].set((dt / 2) ** 2 * unknown[:, place])
 
     mean = jnp.sum(jnp.where(used[:, None], data.x[:, place], 0), 0) / jnp.maximum(data.size, 1)
     spread = jnp.sum(jnp.where(used[:, None], (data.x[:, place] - mean) ** 2, 0), 0) / jnp.maximum(data.size, 1)
@@ -128,9 +128,9 @@ def draw_rates(
         jnp.zeros_like(x).at[:, place].set(-begun),
         jax.vmap(jnp.diag)(jnp.zeros_like(x).at[:, place].set(spread + 1e-12).at[:, measured].set(sensor)),
     )
-    filtered, predicted, after = forward(start, first, onward, off, moved, sensor, measured)
+    filtered, predicted, after = forward(start, first, transition, offset, process, sensor, measured)
 
-    back = jax.vmap(lambda a, p, c: jnp.linalg.solve(c, a @ p).T)(onward, filtered.cov, predicted.cov)
+    back = jax.vmap(lambda a, p, c: jnp.linalg.solve(c, a @ p).T)(transition, filtered.cov, predicted.cov)
     rest = filtered.cov - back @ predicted.cov @ jnp.swapaxes(back, 1, 2)
     drawn = filtered.mean + deviation(begin_key, rest)
     alone = after.mean + deviation(end_key, after.cov)
@@ -149,21 +149,21 @@ def draw_rates(
 
 
 def forward(
-    start: Gaussian, first: Array, onward: Array, off: Array, moved: Array, sensor: Array, measured: np.ndarray
+    start: Gaussian, first: Array, transition: Array, offset: Array, process: Array, sensor: Array, measured: np.ndarray
 ) -> tuple[Gaussian, Gaussian, Gaussian]:
-    """What is known of each row at its beginning, of its end beforehand, and once that is measured: [N, ...]."""
+    """The filter's beliefs about each row: at its beginning, its end as predicted, its end once measured: [N, ...]."""
 
     def row(known: Gaussian, given: Any) -> tuple[Gaussian, tuple[Gaussian, Gaussian, Gaussian]]:
-        start, first, a, off, moved, sensor = given
+        start, first, a, offset, process, sensor = given
         begun = jax.tree.map(partial(jnp.where, first), start, known)
-        expected = Gaussian(off + a @ begun.mean, a @ begun.cov @ a.T + jnp.diag(moved))
+        expected = Gaussian(offset + a @ begun.mean, a @ begun.cov @ a.T + jnp.diag(process))
         seen = expected.cov[measured]
         gain = jnp.linalg.solve(seen[:, measured] + jnp.diag(sensor), seen).T
         after = Gaussian(expected.mean - gain @ expected.mean[measured], expected.cov - gain @ seen)
         return after, (begun, expected, after)
 
     none = jax.tree.map(lambda leaf: leaf[0], start)
-    return jax.lax.scan(row, none, (start, first, onward, off, moved, sensor))[1]
+    return jax.lax.scan(row, none, (start, first, transition, offset, process, sensor))[1]
 
 
 def deviation(key: Key, cov: Array) -> Array:

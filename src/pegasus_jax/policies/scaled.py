@@ -1,4 +1,4 @@
-"""A controller's inputs, in units in which they are of order one: large ones saturate it, small ones go unseen."""
+"""A controller's inputs, in units in which they are of order one: large ones saturate it, small ones do nothing."""
 
 from typing import NamedTuple
 
@@ -31,21 +31,21 @@ def of_data(features: Array, size: Array, units: Array | float = 1.0, found: boo
     A feature whose root mean square is more than LARGE or less than SMALL has its mean subtracted and is divided by its
     standard deviation, or by its unit where it is constant; the others are divided by their unit only. The last `waves`
     are sines and cosines, which are never too small: an angle may have moved little so far. With units to be
-    `found` in the data, those whose root mean square is above 1 then have MOST, and smaller ones are MOST times as
-    large as they were.
+    `found` in the data, a feature whose root mean square is above 1 then has that of MOST, and a smaller one is
+    multiplied by MOST.
     """
     features = features / units
     used = (jnp.arange(features.shape[0]) < size)[:, None]
     count = jnp.maximum(size, 1).astype(features.dtype)
     rows = jnp.where(used, features, 0)
     mean = jnp.sum(rows, 0) / count
-    size_of = jnp.sqrt(jnp.sum(rows**2, 0) / count)
+    rms = jnp.sqrt(jnp.sum(rows**2, 0) / count)
     spread = jnp.sqrt(jnp.sum(jnp.where(used, rows - mean, 0) ** 2, 0) / count)
-    small = (size_of < SMALL) & (jnp.arange(len(size_of)) < len(size_of) - waves)
-    strange = (size_of > LARGE) | small
-    others, most = (jnp.maximum(size_of, 1), MOST) if found else (1, 1)
-    scale = jnp.where(strange, jnp.where(spread > CONSTANT * size_of, spread, 1), others) / most
-    return Input(jnp.where(strange, mean, 0) * units, scale * units)
+    small = (rms < SMALL) & (jnp.arange(len(rms)) < len(rms) - waves)
+    rescaled = (rms > LARGE) | small
+    others, most = (jnp.maximum(rms, 1), MOST) if found else (1, 1)
+    scale = jnp.where(rescaled, jnp.where(spread > CONSTANT * rms, spread, 1), others) / most
+    return Input(jnp.where(rescaled, mean, 0) * units, scale * units)
 
 
 def scaled(given: Input, features: Array) -> Array:

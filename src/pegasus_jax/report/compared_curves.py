@@ -64,7 +64,7 @@ def _marks(every: Sequence[Group], column: str) -> list[Mark]:
         dots = [f"{group.label}, trial {t}: {number(v)}" for t, v in enumerate(center, 1)]
         marks.append(Line(seconds, center, style, f"{group.label} ({len(group.runs)})", dots))
     if column == "calibration":
-        marks.append(Level(1.0, "honest"))
+        marks.append(Level(1.0, "calibrated"))
     if column.startswith("success"):
         marks.append(Level(SOLVED, "90 %"))
     return (

@@ -1,4 +1,4 @@
-"""A run's curves over its trials: cost and success, how honest the model was, and all of it as a table."""
+"""A run's curves over its trials: cost and success, how well calibrated the model was, and all of it as a table."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def early(row: dict[str, Any]) -> str:
 
 
 def calibration(found: Look) -> str:
-    """How honest the model is about its errors, one step and a whole episode ahead."""
+    """How well the model predicts the size of its errors, one step and a whole episode ahead."""
     rows = [row for row in found.rows if row.get("calibration")]
     shares = [(step, read.coverage(step, found.task)) for step in found.steps]
     covered = [(step.number, share) for step, share in shares if share is not None]
@@ -71,15 +71,16 @@ def calibration(found: Look) -> str:
         return ""
     words = (
         "<p>Each episode is compared with what was predicted before the model saw it. One step ahead: the median error"
-        " over the predicted one. 1 is honest, and at 2 errors are twice as large as the model claims. A whole episode"
-        " ahead: the share of the states between the 5 and 95 % quantiles of the imagined particles. 0.9 is honest.</p>"
+        " over the predicted one. 1 is calibrated, and at 2 errors are twice as large as the model claims. A whole"
+        " episode ahead: the share of the states between the 5 and 95 % quantiles of the imagined particles. 0.9 is"
+        " calibrated.</p>"
     )
     charts = []
     if rows:
-        marks = [_by_trial([(row["trial"], row["calibration"]) for row in rows], "imagined"), Level(1.0, "honest")]
+        marks = [_by_trial([(row["trial"], row["calibration"]) for row in rows], "imagined"), Level(1.0, "calibrated")]
         charts.append(chart("One step ahead", "trial", "error / predicted error", marks, log=True, small=True))
     if covered:
-        marks = [_by_trial(covered, "real"), Level(0.9, "honest")]
+        marks = [_by_trial(covered, "real"), Level(0.9, "calibrated")]
         up = "share inside the 90 % band"
         charts.append(chart("A whole episode ahead", "trial", up, marks, y=(-0.04, 1.04), small=True))
     return f'{words}<div class="grid-of">{"".join(charts)}</div>'

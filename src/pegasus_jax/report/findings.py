@@ -16,7 +16,7 @@ from pegasus_jax.runs.stuck import AT_LIMITS, stuck
 from pegasus_jax.shell import typed
 
 TOO_SURE, TOO_UNSURE = 2.0, 0.5  # errors of a model, in what it predicts for them
-COVERED = 0.6  # of a real episode's states lie among the imagined ones; 0.9 would be honest
+COVERED = 0.6  # of a real episode's states lie among the imagined ones; 0.9 would be right
 GAP = 0.2  # between an imagined cost and the plant's
 HELD = 0.1  # between the imagined cost of fresh scenarios and of those that the search held
 LATEST = 3  # trials without a better policy

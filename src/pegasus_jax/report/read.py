@@ -115,7 +115,7 @@ def imagined(step: Step) -> list[np.ndarray]:
 
 
 def coverage(step: Step, task: Task) -> float | None:
-    """The share of an episode's states between the 5 and 95 % quantiles of the imagined particles; 0.9 is honest.
+    """The share of an episode's states between the 5 and 95 % quantiles of the imagined particles; 0.9 is calibrated.
 
     None where one of both is missing. Angles are compared modulo 2 pi; the first state is left out.
     """

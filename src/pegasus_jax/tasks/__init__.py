@@ -20,8 +20,8 @@ from pegasus_jax.tasks import circled, constrained, guide, priors, sensed, terms
 from pegasus_jax.tasks.own_plants import TASKS
 from pegasus_jax.tasks.signals import FILES, named, with_signals
 from pegasus_jax.tasks.starts import from_starts
+from pegasus_jax.tasks.traceable import augmented as augmented
 from pegasus_jax.tasks.traceable import outside as outside
-from pegasus_jax.tasks.traceable import whole as whole
 from pegasus_jax.types import Cost
 
 if TYPE_CHECKING:

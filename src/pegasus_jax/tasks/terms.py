@@ -57,11 +57,11 @@ def agree(cost: Callable[..., Any], reference: Any, goal: Any) -> tuple[str, ...
     return terms
 
 
-def whole(task: Task, cost: Cost | None = None) -> Task:
-    """The task with its cost, or this one, and its `stop` as functions of x' [D + M], and a memory of what they take.
+def augmented(task: Task, cost: Cost | None = None) -> Task:
+    """The task whose cost (or `cost`), `stop` and constraint are functions of the augmented state x' [D + M].
 
-    A task that is whole already stays as it is. Raises ConfigError for a cost that takes what the task has not, or
-    leaves out what it has.
+    Its memory gets what they take. A task that is augmented already stays as it is. Raises ConfigError for a cost that
+    takes what the task does not have, or leaves out what it has.
     """
     if cost is None and task.terms is not None:
         return task
@@ -108,7 +108,7 @@ def of_terms(task: Task, function: Callable[..., Array]) -> Cost:
 
 
 def alone(task: Task) -> Callable[[Array], Array]:
-    """The cost of a task that is not whole as a function of x [D] alone, all else being 0."""
+    """The cost of a task that is not augmented yet, as a function of x [D] alone: all that it takes beside x is 0."""
     controls, cost = jnp.zeros(len(task.control_names)), task.cost.of_state
     rest = {"u": controls, "previous_u": controls, "t": jnp.zeros(())}
     for name, signal in (("reference", task.reference), ("goal", task.goal)):

@@ -14,12 +14,12 @@ from pegasus_jax.tasks.user_code import blamed
 from pegasus_jax.types import Cost
 
 
-def whole(task: Task, cost: Cost | None = None) -> Task:
-    """`terms.whole`. Raises ConfigError, with the user's file and line, also for a cost or stop that JAX cannot trace.
+def augmented(task: Task, cost: Cost | None = None) -> Task:
+    """`terms.augmented`. Raises ConfigError, with the user's file and line, also where JAX cannot trace cost or stop.
 
-    Nothing is computed. What they return is looked at where an episode or a rollout takes it.
+    Nothing is computed. Episodes and rollouts check what the functions return.
     """
-    made = terms.whole(task, cost)
+    made = terms.augmented(task, cost)
     x = jax.ShapeDtypeStruct((len(made.state_names) + len(made.memory.names),), jnp.zeros(()).dtype)
     for name, function in {"cost": made.cost.of_state, "stop": made.stop}.items():
         if function is not None:
