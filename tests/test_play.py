@@ -17,7 +17,7 @@ from pegasus_jax.assembly.experiments import build
 from pegasus_jax.runs import config_io
 from pegasus_jax.tasks import make
 from pegasus_jax.types import Cost, Trajectory
-from pegasus_jax.viz.video import HEIGHT, STRIP, WIDTH, composed, performance, pictures, strip
+from pegasus_jax.viz.video import HEIGHT, STRIP, WIDTH, composed, performance, pictures, strip, until_end
 from test_train import call
 
 ARM = """<mujoco><worldbody><body><joint name="elbow" type="hinge" axis="0 1 0"/>
@@ -118,6 +118,14 @@ def test_bad_input_is_one_clear_line(words: list[str], message: str, tmp_path: P
     assert done.returncode == 2
     assert done.stderr.count("\n") == 1
     assert message in done.stderr
+
+
+@pytest.mark.parametrize(("length", "periods"), [(2, 2), (None, 4)])
+def test_a_film_of_a_simulation_ends_where_its_episode_does(length, periods) -> None:
+    rows = Trajectory(np.zeros((5, 2)), np.zeros((4, 1)), np.zeros(4), None if length is None else np.int32(length))
+    ran, states = until_end(rows, {"q": np.zeros((4, 10, 3))})
+    assert (len(ran.x), len(ran.u), len(ran.cost)) == (periods + 1, periods, periods)
+    assert states["q"].shape == (periods, 10, 3)
 
 
 def test_no_episodes_make_no_film(run: Path) -> None:

@@ -20,7 +20,7 @@ import browser
 from folders import a_run, row
 from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli import watch
-from pegasus_jax.report import serve
+from pegasus_jax.report import progress, serve
 from pegasus_jax.report.progress import state
 from pegasus_jax.runs import store
 
@@ -96,6 +96,14 @@ def test_what_happens_now_is_said(run: Path) -> None:
     store.write_trials(run, [row(trial) for trial in (1, 2, 3)])
     assert state([run]) == "done: 3 of 3 trials"
     assert state([run.parent / "gone"]).startswith(f"{run.parent / 'gone'} is not a run")
+
+
+def test_a_folder_that_is_moved_away_while_it_is_read_is_one_line(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def gone(*_: object) -> None:
+        raise FileNotFoundError(2, "No such file or directory", "trials.jsonl")
+
+    monkeypatch.setattr(progress, "_left", gone)
+    assert "No such file or directory" in state([run])
 
 
 def test_a_tab_that_closes_before_its_answer_leaves_no_traceback(

@@ -18,11 +18,11 @@ def state(paths: Sequence[Path]) -> str:
     try:
         runs = groups.found(paths)
         done = [_counted(run) for run in runs]
+        if len(runs) > 1:
+            return f"{sum(rows >= trials for rows, trials in done)} of {len(runs)} runs are done"
+        return _of_one(runs[0], *done[0])
     except (ConfigError, RunError, OSError) as error:
         return str(error)
-    if len(runs) > 1:
-        return f"{sum(rows >= trials for rows, trials in done)} of {len(runs)} runs are done"
-    return _of_one(runs[0], *done[0])
 
 
 def _counted(run: Path) -> tuple[int, int]:

@@ -58,7 +58,8 @@ def film(run: Path, episodes: int, seed: int, trial: restore.Trial = restore.BES
     if task.environment is None:
         perform = jax.jit(partial(performance, task=task, policy=experiment.policy))
         keys = jax.random.split(jax.random.key(seed), episodes)
-        played = ((ran, pictures(task, states)) for ran, states in (perform(key, state.policy.params) for key in keys))
+        performed = (until_end(*perform(key, state.policy.params)) for key in keys)
+        played = ((ran, pictures(task, states)) for ran, states in performed)
     else:
         played = driven(config, state.policy.params, range(seed, seed + episodes))
     path, writer = run / "play.mp4", None
@@ -88,6 +89,12 @@ def performance(key: Key, params: Params, *, task: Task, policy: Policy) -> tupl
         return policy.apply(params, policy.sample(key), x)
 
     return episode.run_with_trace(key, act, task, task.plant.substates)
+
+
+def until_end(ran: Trajectory, states: Any) -> tuple[Trajectory, Any]:
+    """An episode and the plant's states on the way [H, n, ...] without the periods after an early end, in NumPy."""
+    ran = episode.trimmed(jax.tree.map(np.asarray, ran))
+    return ran, jax.tree.map(lambda leaf: np.asarray(leaf)[: len(ran.u)], states)
 
 
 def driven(config: Config, params: Params, seeds: range) -> Iterator[tuple[Trajectory, list[np.ndarray]]]:
