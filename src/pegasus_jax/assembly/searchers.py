@@ -12,9 +12,8 @@ from pegasus_jax import config as settings
 from pegasus_jax import tasks
 from pegasus_jax.assembly.schedules import at_starts, init_of, scale_for, table_of, width_of
 from pegasus_jax.checks import ConfigError
-from pegasus_jax.imagine import costs as cost
-from pegasus_jax.imagine import limits as limited
-from pegasus_jax.imagine import matching, scenarios
+from pegasus_jax.imagine import costs, matching, scenarios
+from pegasus_jax.imagine import limits as constraints
 from pegasus_jax.imagine.matching import either
 from pegasus_jax.imagine.objective import objective
 from pegasus_jax.imagine.rollout import NoiseUse, rollout
@@ -50,13 +49,13 @@ class Matching(NamedTuple):
 
 
 MATCHINGS = {
-    "always": Matching(lambda _: matching.match, lambda of, _: cost.of_matched(of)),
-    "narrow": Matching(matching.narrow, cost.of_narrow),
-    "never": Matching(lambda _: matching.keep, lambda of, _: cost.of_matched(of)),
+    "always": Matching(lambda _: matching.match, lambda of, _: costs.of_matched(of)),
+    "narrow": Matching(matching.narrow, costs.of_narrow),
+    "never": Matching(lambda _: matching.keep, lambda of, _: costs.of_matched(of)),
 }
 
 # What an episode keeps, such as a goal, is not to be redrawn, nor averaged over before the cost is.
-UNMATCHED = Matching(lambda _: matching.keep, lambda of, _: cost.of_particles(of))
+UNMATCHED = Matching(lambda _: matching.keep, lambda of, _: costs.of_particles(of))
 
 # (key, policy parameters, posterior) -> (rollout, cost [H, K])
 Imagine = Callable[[Key, Params, Params], tuple[Rollout, Array]]
@@ -86,15 +85,7 @@ def search_of(
     noise = NoiseUse(search.policy_noise, search.state_noise, known)
     if isinstance(search, settings.Analytic):
         return analytic_search_of(search, task, dynamics, policy, noise)
-    named = matching_of(search, task)
-    matches = named not in (UNMATCHED, MATCHINGS["never"])
-    states = len(task.state_names) + len(task.memory.names)
-    if (matches or search.standardized_noise) and search.particles <= states:
-        what = "moment matching" if matches else "standardized noise"
-        raise ConfigError(
-            f"search.particles={search.particles} is too few: {what} of {states} dimensions needs more particles than"
-            f" dimensions; the nearest is search.particles={states + 1}"
-        )
+    check_particles(search, task)
     blocks = blocks_of(
         search.particles, task, dynamics, policy, standardized_noise=search.standardized_noise, spread=spread
     )
@@ -103,40 +94,40 @@ def search_of(
         around = jnp.asarray(task.start_mean, float)
         searched = blocks._replace(start=beside_visited(blocks.start, search.visited_starts, task.angles, around))
     pieces: dict[str, Any] = dict(policy=policy, noise=noise)
-    pieces["dynamics"] = limited.absorbing(dynamics, task.constraint, task.stop)
+    pieces["dynamics"] = constraints.absorbing(dynamics, task.constraint, task.stop)
     # A particle's cost is 1 / K of the objective.
     limit = None if (most := search.particle_grad_limit) is None else most / search.particles
     objective_of, ascend = objective, None
     if (constraint := task.constraint) is not None:
-        objective_of = partial(limited.constrained, constraint=constraint)
-        ascend = partial(limited.ascend, bound=constraint.bound)
-    match = named.particles(task.angles)
-    costs = costs_of(search, task)
+        objective_of = partial(constraints.constrained, constraint=constraint)
+        ascend = partial(constraints.ascend, bound=constraint.bound)
+    match = matching_of(search, task).particles(task.angles)
+    cost_for = costs_of(search, task)
     refines = search.refine_fraction > 0
-
-    begun = cache(partial(at_starts, task))
+    start_costs = cache(partial(at_starts, task))
 
     @cache
     def table() -> SearchTable:
-        return table_of(search, width_of(search, begun))
+        return table_of(search, width_of(search, start_costs))
 
     def value(params: Params, posterior: Params, given: Scenarios, row: SearchTable, *weight: Array) -> Any:
         # What no row asks for is not compiled.
         refining, widens = row.refine if refines else None, (table().cost_width != 1).any() or table().holds.any()
-        short = None if limit is None else limit * row.limit
+        longest_gradient = None if limit is None else limit * row.limit
         if search.visited_starts:
             given = started(given, row.refine)
             refining = refining | posterior.goal  # a goal is not to be redrawn either
-            short = scale_for(begun()) * longest(posterior, search.particles) if limit is None else short
+            if limit is None:
+                longest_gradient = scale_for(start_costs()) * longest(posterior, search.particles)
         return objective_of(
             params,
             posterior,
             given,
             *weight,
             **pieces,
-            limit=short,
-            match=either(refining, matching.keep, match),  # what refines has no matching, and each particle's own cost
-            cost=costs(refining, row.cost_width if widens else None),
+            limit=longest_gradient,
+            match=either(refining, matching.keep, match),  # a refinement uses neither matching nor an expected cost
+            cost=cost_for(refining, row.cost_width if widens else None),
         )
 
     clip = optax.identity() if search.grad_clip is None else optax.clip_by_global_norm(search.grad_clip)
@@ -144,13 +135,12 @@ def search_of(
     draws = scenarios.sampler(searched, Period(**vars(search.period)))
     more: dict[str, Any] = dict(reset_optimizer=search.reset_optimizer, ascend=ascend)
     found = tabled(init_of(search), table, lambda rows: searcher(Problem(value, draws, optimizer, rows, **more)))
-    # A refined policy is good for particles, not for their Gaussian.
-    seen_last = matching.keep if refines else match
-    imagine = partial(imagined, **pieces, match=seen_last, task=task)
+    # A refined policy is made for the particles themselves, not for their Gaussian.
+    imagine = partial(imagined, **pieces, match=matching.keep if refines else match, task=task)
     if search.num_starts > 1:
         judge = None if constraint is None else partial(judged, imagine=partial(imagine, blocks=blocks), task=task)
-        lasting = search.anneal_trials > 1  # one schedule for all searches: who began late would be behind
-        # What refines may end with another than its last.
+        lasting = search.anneal_trials > 1  # one schedule over all searches: a later member would miss its start
+        # A refinement may end with another policy than that of its last step.
         window = 1 if search.refine_fraction else max(1, search.steps // 20)
         found = best_of(found, num_starts=search.num_starts, window=window, lasting=lasting, judge=judge)
     if not search.visited_starts:
@@ -159,12 +149,24 @@ def search_of(
     return Searching(found, partial(imagine, blocks=blocks), lambda *given: jnp.mean(imagine(*given, blocks=mixed)[1]))
 
 
+def check_particles(search: settings.Search, task: Task) -> None:
+    """Raises ConfigError where moment matching, or standardized noise, needs more particles."""
+    matches = matching_of(search, task) not in (UNMATCHED, MATCHINGS["never"])
+    states = len(task.state_names) + len(task.memory.names)
+    if (matches or search.standardized_noise) and search.particles <= states:
+        what = "moment matching" if matches else "standardized noise"
+        raise ConfigError(
+            f"search.particles={search.particles} is too few: {what} of {states} dimensions needs more particles than"
+            f" dimensions; the nearest is search.particles={states + 1}"
+        )
+
+
 def judged(key: Key, members: Params, posterior: Params, *, imagine: Imagine, task: Task) -> Array:
-    """[N] of policies with the parameters `members` [N, ...] under the same fresh scenarios: the lowest is the best."""
+    """Ranks [N] of policies with parameters `members` [N, ...] under the same fresh scenarios: the lowest is best."""
     constraint = task.constraint
-    rolled, costs = jax.vmap(imagine, (None, 0, None))(key, members, posterior)
-    chance = jax.vmap(partial(limited.probability, constraint=constraint))(rolled.x)
-    return limited.ranked(jnp.mean(costs, (1, 2)), chance, bound=constraint.bound)
+    rolled, cost = jax.vmap(imagine, (None, 0, None))(key, members, posterior)
+    chance = jax.vmap(partial(constraints.probability, constraint=constraint))(rolled.x)
+    return constraints.ranked(jnp.mean(cost, (1, 2)), chance, bound=constraint.bound)
 
 
 def matching_of(search: settings.Search, task: Task) -> Matching:
@@ -185,7 +187,7 @@ def tabled(
 
 
 def fresh_policies(search: settings.Search | settings.Analytic) -> int:
-    """How many policies that know nothing a search is given: two for a race, all but the given one side by side."""
+    """How many untrained policies a search is given: two for a race, or all but the given one side by side."""
     return max(2, search.num_starts - 1) if isinstance(search, settings.Search) else 2
 
 
@@ -248,21 +250,21 @@ def analytic_search_of(
 def costs_of(search: settings.Search, task: Task) -> Callable[[Array | None, Array | None], Callable[[Array], Array]]:
     """(whether this refines, a factor of the cost's width; None: never) -> costs [H, K] or [H, 1] of x [H, K, D]."""
 
-    def costs(refining: Array | None, width: Array | None) -> Callable[[Array], Array]:
-        now = task.cost if width is None else cost.widened(task.cost, width)
+    def cost_for(refining: Array | None, width: Array | None) -> Callable[[Array], Array]:
+        now = task.cost if width is None else costs.widened(task.cost, width)
         if search.cost_estimator != "gaussian":
-            return until_stop(task, cost.of_particles(now))
+            return until_stop(task, costs.of_particles(now))
         matched = matching_of(search, task).cost(now, task.angles)
-        return until_stop(task, either(refining, cost.of_particles(now), matched))
+        return until_stop(task, either(refining, costs.of_particles(now), matched))
 
-    return costs
+    return cost_for
 
 
-def until_stop(task: Task, costs: Callable[[Array], Array]) -> Callable[[Array], Array]:
+def until_stop(task: Task, cost_of: Callable[[Array], Array]) -> Callable[[Array], Array]:
     """The costs of particles that end where the task's episodes do."""
     if task.stop is None:
-        return costs
-    return lambda x: cost.until_stop(costs(x), x, task.stop, task.stop_cost)  # type: ignore[arg-type]
+        return cost_of
+    return lambda x: costs.until_stop(cost_of(x), x, task.stop, task.stop_cost)  # type: ignore[arg-type]
 
 
 def blocks_of(
@@ -296,7 +298,7 @@ def imagined(
 ) -> tuple[Rollout, Array]:
     """Rollouts under fresh scenarios and the cost of every particle [H, K]."""
     rolled = rollout(params, posterior, scenarios.draw(key, 0, posterior, blocks=blocks, period=Period()), **pieces)
-    return rolled, until_stop(task, cost.of_particles(task.cost))(rolled.x[1:])
+    return rolled, until_stop(task, costs.of_particles(task.cost))(rolled.x[1:])
 
 
 def first_seen(key: Key, *, task: Task) -> Array:

@@ -29,13 +29,13 @@ def of_csv(path: Path) -> Table:
     for number, line in kept:
         if len(line) > csv.field_size_limit():
             raise ConfigError(f"{path} line {number} has {len(line):,} letters; expected a row of numbers")
-    comma = _mark([line for _, line in kept])
-    cells = [_cells(f"{path} line {number}", line, comma) for number, line in kept]
+    delimiter = _delimiter([line for _, line in kept])
+    cells = [_cells(f"{path} line {number}", line, delimiter) for number, line in kept]
     while len({*map(len, cells)}) == 1 < len(cells[0]) and not any(row[-1] for row in cells):  # of a comma at its end
         cells = [row[:-1] for row in cells]
     remarks = [line for line in lines[: kept[0][0] - 1] if line[:1] == "#"]
-    above = [cell.strip() for cell in remarks[-1].lstrip("#").split(comma)] if remarks else []
-    names, header = _header(cells[0], above, cells[1] if len(cells) > 1 else cells[0], comma)
+    above = [cell.strip() for cell in remarks[-1].lstrip("#").split(delimiter)] if remarks else []
+    names, header = _header(cells[0], above, cells[1] if len(cells) > 1 else cells[0], delimiter)
     body, places = cells[header:], np.array([number for number, _ in kept][header:], int)
     if not body:
         raise ConfigError(f"{path} has a header and no rows; expected rows of numbers")
@@ -44,7 +44,7 @@ def of_csv(path: Path) -> Table:
     if wrong := [(line, row) for line, row in zip(places, body, strict=True) if len(row) != len(names)]:
         line, row = wrong[0]
         raise ConfigError(f"{path} line {line} has {len(row)} columns; expected {len(names)}, as in its first row")
-    numbers = [[_number(cell, comma) for cell in row] for row in body]
+    numbers = [[_number(cell, delimiter) for cell in row] for row in body]
     texts = {
         (i, j): body[i][j]
         for i, row in enumerate(numbers)
@@ -55,42 +55,42 @@ def of_csv(path: Path) -> Table:
     return Table(str(path), names, rows, places, "line", texts)
 
 
-def _cells(where: str, line: str, comma: str) -> list[str]:
-    row = next(csv.reader([line + "\n"], delimiter=comma))
+def _cells(where: str, line: str, delimiter: str) -> list[str]:
+    row = next(csv.reader([line + "\n"], delimiter=delimiter))
     if row[-1].endswith("\n"):  # the quote goes on
         raise ConfigError(f"{where}: a quote is not closed on its line; expected each cell on one line")
     return [cell.strip() for cell in row]
 
 
-def _mark(lines: list[str]) -> str:
-    """What is between the cells of lines: a semicolon before a tab before a comma, which may be a decimal one.
+def _delimiter(lines: list[str]) -> str:
+    """The delimiter of lines: a semicolon, a tab or a comma, in this order, as a comma may be a decimal mark.
 
-    The first by which lines have as many cells, more than one, and the last one numbers; else one of the first line.
+    The first that gives all lines as many cells, more than one, and the last line numbers; else one that the first has.
     """
-    for mark in ";\t,":
-        rows = [next(csv.reader([line], delimiter=mark), []) for line in (*lines[:2], lines[-1])]
+    for delimiter in ";\t,":
+        rows = [next(csv.reader([line], delimiter=delimiter), []) for line in (*lines[:2], lines[-1])]
         last = [cell.strip() for cell in rows[-1]]
-        numbers = not any(cell and _number(cell, mark) is None for cell in last)
+        numbers = not any(cell and _number(cell, delimiter) is None for cell in last)
         if numbers and len(last) > 1 and {*map(len, rows)} == {len(last)}:
-            return mark
-    return next((mark for mark in ",;\t" if mark in lines[0]), ",")
+            return delimiter
+    return next((delimiter for delimiter in ",;\t" if delimiter in lines[0]), ",")
 
 
-def _header(first: list[str], above: list[str], second: list[str], mark: str) -> tuple[tuple[str, ...], bool]:
+def _header(first: list[str], above: list[str], second: list[str], delimiter: str) -> tuple[tuple[str, ...], bool]:
     """The names of the columns, of the first row and the remark above it, and whether that row is them and no data."""
     numbered = [str(i) for i in range(len(first))]
     # Pandas writes the numbers of an array's columns behind an empty cell, which is over those of its rows.
     of_array = not first[0] and bool(second[0]) and all(cell.isdecimal() for cell in first[1:])
-    if of_array or any(cell and _number(cell, mark) is None for cell in first):
+    if of_array or any(cell and _number(cell, delimiter) is None for cell in first):
         return tuple(first), True
-    if len(above) == len(first) and all(cell and _number(cell, mark) is None for cell in above):
+    if len(above) == len(first) and all(cell and _number(cell, delimiter) is None for cell in above):
         return tuple(above), False
     return tuple(numbered), first == numbered  # as pandas writes the columns of an array
 
 
-def _number(cell: str, mark: str) -> float | None:
-    """A cell's number, whose decimal mark may be a comma where none is between the cells; None: it is none."""
+def _number(cell: str, delimiter: str) -> float | None:
+    """A cell's number, None where it is none. Its decimal mark may be a comma unless that is the delimiter."""
     try:
-        return float(cell if mark == "," or cell.endswith(",") else cell.replace(",", "."))
+        return float(cell if delimiter == "," or cell.endswith(",") else cell.replace(",", "."))
     except ValueError:
         return None
