@@ -19,7 +19,7 @@ from pegasus_jax.checks import ConfigError, RunError
 from pegasus_jax.cli import export as cli
 from pegasus_jax.config import KINDS
 from pegasus_jax.exports import as_c, parity, write
-from pegasus_jax.exports.learned import Learned, said
+from pegasus_jax.exports.learned import Learned, for_comment
 from pegasus_jax.exports.parity import observations
 from pegasus_jax.math.circles import to_observation
 from pegasus_jax.runs import restore, store
@@ -233,7 +233,7 @@ def test_without_a_compiler_or_a_package_it_says_so(
 
 
 def test_a_name_cannot_end_a_comment() -> None:
-    assert said('arm */ #include "x" \\ """') == "arm _/ _include _x_ _ ___"
+    assert for_comment('arm */ #include "x" \\ """') == "arm _/ _include _x_ _ ___"
 
 
 # The command

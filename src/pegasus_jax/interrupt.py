@@ -1,4 +1,4 @@
-"""Signals that ask a command to stop: a robot is let go first, and the process ends with 128 + the signal's number."""
+"""Signals that ask a command to stop: a robot is closed first, and the process ends with 128 + the signal's number."""
 
 import contextlib
 import os
@@ -68,7 +68,7 @@ def check() -> None:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Signals wait until the block ends, but where `heard` lets them through: what was measured is to be kept."""
+    """Signals wait until the block ends, except in `heard` blocks, so that what was measured is stored first."""
     before, _State.held = _State.held, True
     try:
         yield
@@ -101,7 +101,7 @@ def clean_up() -> None:
 
 
 def let_go(close: Callable[[], None]) -> None:
-    """Call a robot's `close` to its end: signals wait for it, a third one does not. What it raises is said."""
+    """Call a robot's `close` and wait for its end, also after one or two signals. An error in it is printed."""
     _State.closing = True
     try:
         close()
@@ -123,9 +123,9 @@ def status() -> int:
 
 
 def end(code: int) -> None:
-    """End the process with this status, or with 2 for 0 where a robot was not closed: its motors may be on.
+    """End the process with this status; 2 in place of 0 where a robot was not closed, as its motors may be on.
 
-    What still compiles is waited for by a success only, others' threads never.
+    Only a success waits for threads that still compile, and nothing waits for threads of others.
     """
     code = code or 2 * _State.unclosed
     for thread in threading.enumerate() if code == 0 else ():

@@ -58,7 +58,7 @@ def main(
     """Run a command: 0 done, 2 what cannot be or a robot that did not close, in one line, 130 after Ctrl-C.
 
     `always` are words that come after those that were typed, if any were.
-    Whatever ends it, a robot is let go first, and no thread that still compiles is waited for.
+    Whatever ends it, environments are closed first, and threads that still compile are not waited for.
     """
     # What JAX makes when it traces stays: to look for garbage in it so often took a tenth of a short run's time.
     gc.set_threshold(100_000)

@@ -12,7 +12,7 @@ import numpy as np
 
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Limit, Recall, Squash, Standardize, layers_of
-from pegasus_jax.exports.learned import Learned, said
+from pegasus_jax.exports.learned import Learned, for_comment
 from pegasus_jax.shell import split
 
 HEADER = """\
@@ -91,14 +91,14 @@ def write(learned: Learned, name: str) -> bytes:
         code += _remembered(kept)
     fill = {"T": real, "F": suffix, "P": name}
     return HEADER.format(
-        title=said(learned.title),
+        title=for_comment(learned.title),
         type=real,
         name=name,
         guard=name.upper(),
         observations=observations,
         controls=len(learned.task.control_names),
-        observation=said(", ".join(learned.observation)),
-        control=said(", ".join(learned.task.control_names)),
+        observation=for_comment(", ".join(learned.observation)),
+        control=for_comment(", ".join(learned.task.control_names)),
         period=float(learned.task.dt),
         forgets=": there is nothing to forget" if kept is None else "; one controller of this kind in a program",
         memory="" if kept is None else _memory(kept, name, real),

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from pegasus_jax.exports.layers import Dense, Features, Kernels, Layer, Limit, Recall, Squash, Standardize, layers_of
-from pegasus_jax.exports.learned import Learned, said
+from pegasus_jax.exports.learned import Learned, for_comment
 
 MODULE = '''\
 """{title}, as written by pegasus-export.
@@ -97,7 +97,7 @@ def write(learned: Learned, name: str) -> bytes:
         arrays |= used
     code += REMEMBERED if remembers else ["return control"]
     text = MODULE.format(
-        title=said(learned.title),
+        title=for_comment(learned.title),
         name=name,
         observations=sizes[0],
         controls=sizes[1],

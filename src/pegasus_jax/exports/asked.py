@@ -1,4 +1,4 @@
-"""What a file is asked for at each call, a goal, a reference or the time, as further entries of its observation."""
+"""A goal, a reference or the time for an exported controller, at each call: further entries of its observation."""
 
 from collections.abc import Callable
 from typing import Any
@@ -12,9 +12,9 @@ from pegasus_jax.tasks import sensed, terms
 
 
 def asking(control: Callable[[Any], np.ndarray], task: Task, seed: int) -> tuple[Callable[..., np.ndarray], list[Any]]:
-    """(act(t, x [D]) -> u, memories): a file's controller, asked for what an episode of the task asks for.
+    """(act(t, x [D]) -> u, memories): a file's controller, given the goals and references of an episode of the task.
 
-    The memory of the episode's start is put into `memories`. All is compiled here, before anything moves.
+    The memory at the episode's start is put into `memories`. All is compiled here, before anything moves.
     """
     names, memory, memories = terms.asked_names(task), task.memory, []
     if not names:

@@ -74,8 +74,8 @@ class Learned(NamedTuple):
 def controlling(learned: Learned) -> Callable[..., tuple[Array, Array]]:
     """The controller as a function to be traced: (observation [O], memory [M]) -> (control [U], memory [M]).
 
-    Every noisy unit is at its mean. A memory of zeros begins an episode; M is 0 where nothing is remembered. A third
-    argument is the control that was sent, and is remembered, where that is another one.
+    Every noisy unit is at its mean. A memory of zeros begins an episode; M is 0 where nothing is remembered. Where
+    another control is sent than the function returns, the third argument is that one, to be remembered.
     """
     task, memory, sensors = learned.task, learned.memory, len(learned.sensors)
     see, _, advance = recall.steps(memory)
@@ -103,6 +103,6 @@ def driven(act: Callable[[Any, Any], Any], observations: np.ndarray, memory: int
     return np.stack(found)
 
 
-def said(text: str) -> str:
-    """A text as a comment of any language can have it."""
+def for_comment(text: str) -> str:
+    """A text without the characters that could end a comment in some language."""
     return re.sub(r"[^\w .,:;()\[\]/+^'-]", "_", text)

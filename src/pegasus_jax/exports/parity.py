@@ -41,8 +41,8 @@ class Parity(NamedTuple):
 def observations(run: Path, task: Task) -> tuple[np.ndarray, int]:
     """Observations [1000, O], the first of which were stored by the run, and how many.
 
-    The others are uniform in the states' own box, widened by half its width on each side. What a policy is asked for
-    beside them is not stored: up to twice its size.
+    The others are uniform in the box of these states, widened by half its width on each side. Goals, references and
+    times are not stored: they are uniform up to twice their unit.
     """
     draw = np.random.default_rng(0)
     episodes = [store.load_episode(run, trial) for trial in store.numbered(run / "episodes", ".npz")]
@@ -72,9 +72,9 @@ def compared(run: Callable[[np.ndarray, int], np.ndarray], learned: Learned, fol
     if found.shape != shape:
         raise RunError(f"the file returns controls {[*found.shape]}, the policy {[*shape]}; it was not kept")
     with precision(learned.config):
-        expected = policys(learned, given, found)
+        expected = controls_of(learned, given, found)
     with jax.enable_x64(True):
-        exact = policys(learned, given.astype(np.float64), found.astype(np.float64))
+        exact = controls_of(learned, given.astype(np.float64), found.astype(np.float64))
     span = np.asarray(task.control_high) - np.asarray(task.control_low)
     difference = np.abs(found.astype(float) - expected) / span
     rounding = np.abs(expected - exact) / span
@@ -88,10 +88,10 @@ def compared(run: Callable[[np.ndarray, int], np.ndarray], learned: Learned, fol
     return parity
 
 
-def policys(learned: Learned, given: np.ndarray, sent: np.ndarray) -> np.ndarray:
+def controls_of(learned: Learned, given: np.ndarray, sent: np.ndarray) -> np.ndarray:
     """The controls [N, U] of a policy for observations [N, O], each after those that were `sent` [N, U] before.
 
-    Of a policy that sees its past controls a rounding may grow from one to the next: the file is followed.
+    A policy that sees its past controls is given those that the file sent: else rounding errors would add up.
     """
     act = controlling(learned)
 

@@ -1,4 +1,4 @@
-"""What nobody has to wait for: a thread does it while the robot moves, and while the next search is under way."""
+"""Work that nobody has to wait for: a thread does it while the robot moves, and during the next search."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, wait
@@ -10,7 +10,7 @@ PATIENCE = 2.0  # [s] that a command which was asked to stop waits for what is u
 
 
 class Beside:
-    """Does one thing after the other; what one raises is raised where the next one is handed over, or by `check`."""
+    """Does one piece of work after the other. Its error is raised when the next one is handed over, or by `check`."""
 
     def __init__(self, threads: bool = True) -> None:
         self.threads = threads
@@ -39,12 +39,12 @@ class Beside:
 
 @contextmanager
 def beside(threads: bool = True) -> Iterator[Beside]:
-    """When the block ends, by an error too, all that was handed over is done; a signal waits for it for 2 s at most."""
-    hand = Beside(threads)
+    """A `Beside` whose work is done when the block ends, by an error too; after a signal it has 2 s to end."""
+    worker = Beside(threads)
     try:
-        yield hand
-        hand.finish()
+        yield worker
+        worker.finish()
     except BaseException as error:
-        if hand.last is not None:
-            wait([hand.last], PATIENCE if isinstance(error, KeyboardInterrupt) else None)
+        if worker.last is not None:
+            wait([worker.last], PATIENCE if isinstance(error, KeyboardInterrupt) else None)
         raise

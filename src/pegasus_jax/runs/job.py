@@ -1,4 +1,4 @@
-"""What the loop of Alg. 1 works with: the config, its compiled experiment, who shows progress, and who writes."""
+"""What the loop of Alg. 1 works with: the config, its compiled experiment, the display and the writer."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

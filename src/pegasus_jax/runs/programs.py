@@ -55,7 +55,7 @@ SINGLE_THREAD_BELOW = 128  # particles that one thread of a CPU imagines as fast
 
 
 class Jitted:
-    """A jitted function that says how long its caller waited for compiling; compiles once, or it is a defect."""
+    """A jitted function that knows how long its caller waited for the compiler. It compiles for one set of shapes."""
 
     def __init__(self, function: Callable[..., Any], lower: Callable[..., Any] | None = None, **options: Any) -> None:
         self.function, self.compiled, self.seconds = jax.jit(function, **options), None, 0.0
@@ -211,9 +211,9 @@ class Program:
 
 
 def begun(function: Callable[..., Any], *arguments: Any) -> Future:
-    """The function's result to come. Another thread computes it, so that a signal always finds this one awake.
+    """A future of the function's result. Another thread computes it, so that this one can always answer a signal.
 
-    A thread that does not keep the process alive: who is asked to stop does not wait for the compiler.
+    The thread does not keep the process alive: a command that is asked to stop does not wait for the compiler.
     """
     coming: Future = Future()
 

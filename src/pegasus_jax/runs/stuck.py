@@ -1,4 +1,4 @@
-"""What a person is told of a run that goes on so without help: a control at its limit, ends that nobody imagines."""
+"""Notes on runs that may need a person's help: a control at its limit, early ends that imagined episodes lack."""
 
 from collections.abc import Sequence
 from typing import Any

@@ -1,7 +1,7 @@
 """Programs as JAX traced them, kept beside the compiled ones: a second run on one of our own plants traces nothing.
 
 A file is a program's StableHLO with the names of the tuples that go in and come out of it, and no pickle. Whoever can
-write there runs what they like, as with compiled programs: the folder is the same, and so is what is asked of it.
+write there runs what they like, as with compiled programs: it is the same folder, with the same checks.
 """
 
 import contextlib

@@ -145,17 +145,17 @@ def learn(job: Job, states: RunState, done: int | None = None) -> RunState:
         before[:] = [] if "logs" in rows[0] else rows
 
     # A robot is driven by this process: nothing may hold up its control periods.
-    with beside(job.program.concurrent and job.experiment.task.environment is None) as hand:
+    with beside(job.program.concurrent and job.experiment.task.environment is None) as in_background:
         for trial in range((done or 0) + 1, job.config.trials + 1):
-            hand.check()
+            in_background.check()
             states, result = one_trial(job, states, trial)
-            hand(partial(kept, trial, states, result))
+            in_background(partial(kept, trial, states, result))
         job.display.phase(job.config.trials, "evaluate", 0.9)
     return states
 
 
 def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, Result]:
-    """One round of Alg. 1 for every seed, and what is to be asked how it went: no episode waits for that."""
+    """One round of Alg. 1 for every seed, and a function that makes its rows: the next episode does not wait for it."""
     if trial == 1 and job.logs.rows:
         return of_logs(job, states)
     config, task, program = job.config, job.experiment.task, job.program
@@ -164,14 +164,14 @@ def one_trial(job: Job, states: RunState, trial: int) -> tuple[RunState, Result]
     ended, trajectories, before = time.monotonic(), stacked(episodes, task), states
     # Line 4: add the episode to the data.
     states, found = program("add_episode", states, trajectories), [unknown(task)] * len(episodes)
-    # Lines 5 and 6: fit the model, search a policy; not where the next episode is random too, and needs no policy.
+    # Lines 5 and 6: fit the model, search a policy; not where the next episode is random too.
     if trial >= config.explore.trials:
         states, found = improved(job, states, trial, trajectories)
     evaluation = evaluated(job, states, trial, ended)
 
     def rows() -> list[Row]:
         measured, seconds = evaluation()
-        # Before this episode taught the model, and after another had.
+        # By the model before this episode, where it has learned from an earlier one.
         judged, aside = trial > first_search(config), program.aside()
         calibration = gather(aside("calibrate", before, trajectories)) if judged else np.full(len(episodes), np.nan)
         sizes = gather(states.data.size)
