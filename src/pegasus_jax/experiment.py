@@ -118,9 +118,9 @@ def experiment(
     what a policy costs a step; None: the mean of that. `first_search` is the trial after which a policy is searched for
     the first time; 0: before the first episode. One that is `begun` has learned elsewhere before that. With `compare` a
     policy whose newest episode succeeded is followed only by one that is expected to cost less.
-    `remember(posterior, state)` is what all of them are given in a posterior's place. With an environment instead of a
-    plant in JAX, `episode` and `collect` are not pure, and `drive` is there. A search is given `num_fresh` policies
-    that know nothing. With `refine_successes` the one after an episode that succeeded is called with works=True.
+    All of them are given `remember(posterior, state)` in place of the posterior. With an environment instead of a
+    plant in JAX, `episode` and `collect` are not pure, and `drive` is there. A search is given `num_fresh` untrained
+    policies. With `refine_successes` the search after an episode that succeeded is called with works=True.
     """
     states, controls, memory = len(task.state_names), len(task.control_names), task.memory
     see, given, _ = recall.steps(memory)
@@ -216,8 +216,8 @@ def experiment(
         key = trial_key(state.key, state.trial, SEARCH)
         posterior = posterior_of(state)
 
-        # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and one
-        # that knows nothing is the better start.
+        # A policy driven into saturation sits where the saturating cost is flat: no gradient brings it back, and an
+        # untrained policy is the better start.
         keys = jax.random.split(trial_key(state.key, state.trial, RESTART), num_fresh)
         fresh = jax.vmap(lambda key: adapted(policy.init(key), state.data))(keys)
         untrained = (state.trial <= first_search) & (first == 0)
@@ -245,10 +245,10 @@ def experiment(
         return None if task.constraint is None else limits.probability(rolled.x, task.constraint)
 
     def succeed(state: RunState, incumbent: Params) -> tuple[RunState, Successor]:
-        """The policy that goes on after a search: its own, or an incumbent that works and is expected to cost no more.
+        """The policy that goes on after a search: the new one, or an incumbent that works and should cost no more.
 
-        Both are imagined on the same fresh scenarios under the new model. One that failed teaches nothing new. One that
-        is expected to break the task's constraint more often than its bound wins over none that is not.
+        Both are imagined under the same fresh scenarios and the new model. An incumbent that failed is replaced: its
+        next episode would teach nothing new. If one of them alone should keep the task's constraint, that one goes on.
         """
         posterior = posterior_of(state)
         key = trial_key(state.key, state.trial, IMAGINE)
@@ -277,7 +277,7 @@ def experiment(
         return state, Successor(rolled, cost, old, replaced, chance)
 
     def improve(state: RunState) -> tuple[RunState, tuple[FitInfo, SearchInfo]]:
-        """Fit and search (Alg. 1 lines 5 and 6), unless the next episode is random too: then nothing, and NaN of it."""
+        """Fit and search (Alg. 1 lines 5 and 6); neither where the next episode is random too, and an info of NaN."""
         if explore_trials < 2:
             return learn_and_improve(state)
         info = jax.tree.map(_unknown, jax.eval_shape(learn_and_improve, state)[1])

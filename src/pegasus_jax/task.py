@@ -63,7 +63,7 @@ class Task(NamedTuple):
 
     @property
     def observed(self) -> int:
-        """How many entries x of its user's functions has: of an angle of a circle the cosine and the sine."""
+        """The size of the observation that the user's functions get: two entries for each angle of `circles`."""
         return len(self.state_names) + len(self.circles)
 
     @property

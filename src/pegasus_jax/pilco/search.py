@@ -113,8 +113,8 @@ def analytic(
     """The searcher that minimizes `objective(policy parameters, posterior, std)` by L-BFGS, as far as that goes.
 
     `noise_std(key, posterior)` is the model's noise std [D]. With `restart` a search starts from its fresh policy where
-    that costs no more than the one before. A search knows nothing of the ones before: their values and
-    their curvature were another model's.
+    that costs no more than the one before. No search uses values or the curvature of an earlier one: those were of
+    another model.
     """
 
     def run(

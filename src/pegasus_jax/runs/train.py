@@ -93,7 +93,7 @@ def train_seeds(
         before = config_io.load(folders[0] / "config.yaml") if resume else config
         store.enough(config.trials, max([0, *(trial for run in folders for trial in checkpoint.available(run))]))
         begun = logged.of_run(config, folders[0]) if resume else logged.of_config(config, logs)
-        closing = held.enter_context(ExitStack())  # of what may wait for a network: a robot is let go before
+        closing = held.enter_context(ExitStack())  # of trackers, which may wait for a network: a robot is closed before
         job = held.enter_context(opened(config, list(runs), mesh, begun, folders[0]))
         task, say = job.experiment.task, job.display.line
         for run in folders if begun.rows and not resume and is_main_process() else ():

@@ -247,7 +247,7 @@ def compared(config: Config, task: Task) -> None:
     if config.task == MJCF:
         from pegasus_envs import mjcf_check
 
-        # Late, a plant's state holds controls that wait too, which MuJoCo knows nothing of.
+        # With a delay the plant's state also holds the controls that wait, which MuJoCo does not have.
         plant = unsensed(config).plant if config.sensors.delay else task.plant
         with _refused(f"mjcf={config.mjcf}"):
             mjcf_check.compare(plant)

@@ -1,4 +1,4 @@
-"""What a user's plant, and the user, left unsaid, and what is taken for it: notes, one line each."""
+"""Notes on what neither the user nor the plant has said, and what is assumed instead: one line each."""
 
 from contextlib import suppress
 
