@@ -100,7 +100,7 @@ def after(row: SearchTable, learner: TrainState, visit: Visit, problem: Any) -> 
     lost = jnp.isnan(state.last)
     older, less = (value <= state.last) | lost, (value < state.last) | lost
     # The fresh policy is also taken where the search is to find another policy than the given one.
-    fresh = older | (state.no_improvement | (state.worked > 0)) & ~jnp.isnan(value)
+    fresh = (older | state.no_improvement | (state.worked > 0)) & ~jnp.isnan(value)
     taken = jnp.stack([True, fresh, True, less, older, older])[row.candidate] | steps_now
     params, state = optax.tree.where(taken, visit.params, params), returned(row, taken, state)
     now, more = TrainState(params, state.optimizer), dict(value=value, grad=gradient, value_fn=visit.objective)

@@ -136,7 +136,7 @@ def analytic(
             """These, or the fresh ones where those cost no more."""
             one = jax.tree.map(lambda leaf: leaf[0], fresh)
             own, other = jax.vmap(value)(jax.tree.map(lambda *leaves: jnp.stack(leaves), params, one))
-            return optax.tree.where((other <= own) | jnp.isnan(own), one, params)
+            return optax.tree.where((other <= own) | jnp.isnan(own) & ~jnp.isnan(other), one, params)
 
         new = jnp.asarray(first) == 0
         if restart:
