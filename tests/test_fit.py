@@ -88,6 +88,7 @@ def test_a_bad_gradient_skips_its_update_and_nothing_else(value):
     assert len(bad) == 40
     assert 0 < sum(bad) < 40
     assert info.skipped == sum(bad)
+    assert np.isfinite([info.loss, info.first]).all()
     good = 40 - sum(bad)
     np.testing.assert_allclose(learner.params, -good * np.ones((2, 2)), rtol=1e-4)  # Adam's step on a constant gradient
     assert learner.optimizer[0].count == good
@@ -105,6 +106,7 @@ def test_a_fit_that_sees_nothing_but_bad_numbers_changes_nothing(spoil):
     assert same(after.params, learner.params)
     assert same(after.optimizer, learner.optimizer)
     assert info.skipped == 50
+    assert np.isnan([info.loss, info.first]).all()
 
 
 OPTIMIZERS = {

@@ -17,7 +17,7 @@ from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, ModelLearner
 class FitInfo(NamedTuple):
     """How a fit went."""
 
-    loss: Array  # [] mean over the last tenth of the steps [nats a row]
+    loss: Array  # [] mean over the last tenth of the steps, without skipped ones [nats a row]; NaN: all were
     first: Array  # [] the same over the first tenth
     skipped: Array  # [] updates skipped because a loss or its gradient was not finite
 
@@ -58,7 +58,8 @@ def fit(
 
     learner, (losses, finite) = jax.lax.scan(step, learner, jax.random.split(key, steps))
     tenth = max(steps // 10, 1)
-    return learner, FitInfo(jnp.mean(losses[-tenth:]), jnp.mean(losses[:tenth]), jnp.sum(~finite))
+    last, first = (jnp.mean(losses[part], where=finite[part]) for part in (slice(-tenth, None), slice(tenth)))
+    return learner, FitInfo(last, first, jnp.sum(~finite))
 
 
 def falling(rate: float, decay: float, steps: int) -> float | optax.Schedule:
