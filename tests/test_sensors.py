@@ -22,16 +22,14 @@ from pegasus_jax.episode import run
 from pegasus_jax.exports import as_c, parity, write
 from pegasus_jax.imagine import matching
 from pegasus_jax.imagine.rollout import rollout
-from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.math.units import rate_of
-from pegasus_jax.models.smoothed import alternating, corrected, draw_rates
 from pegasus_jax.policies.rate_limited import rate_limited
 from pegasus_jax.runs import check, config_io, facts, store
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.start import preset
 from pegasus_jax.tasks.remembered import remembering, smoothed
 from pegasus_jax.tasks.sensed import coordinates, reduced, sensed
-from pegasus_jax.types import Batch, Cost, Dataset, Dynamics, ModelLearner, Prediction, Scenarios, TrainState
+from pegasus_jax.types import Cost, Dynamics, Prediction, Scenarios
 from probes import PLAIN, cart, linear_policy, tiny
 
 H, DT = 8, 0.3
@@ -132,100 +130,6 @@ def test_starts_of_one_s_own_are_those_of_what_is_measured(history):
     task = build(config).task
     np.testing.assert_array_equal(np.asarray(task.starts)[:, :2], [[0, 0], [1, 3]])
     assert np.shape(task.starts)[1] == np.shape(task.starts_std)[0] == len(task.start_mean)
-
-
-def measured(lengths=(4, 3), capacity=9, seed=0):
-    """The probe's cart in episodes of these lengths: its data, positions with noise of 3 cm and rates far off."""
-    draw, rows = np.random.default_rng(seed), []
-    for length in lengths:
-        state = draw.normal(size=2)
-        x, u = [state], draw.uniform(-2, 2, length)
-        for control in u:
-            x.append(A @ x[-1] + B * control + draw.normal(size=2) * [0.02 * DT / 2, 0.02])
-        seen = np.array(x) + draw.normal(size=(length + 1, 2)) * [0.03, 0.5]
-        flags = np.arange(length) == 0
-        rows += list(zip(seen[:-1], np.column_stack([u, flags]), np.diff(seen, axis=0), strict=True))
-    columns = [np.concatenate([np.array(c), np.zeros((capacity - len(rows), 2))]) for c in zip(*rows, strict=True)]
-    return Dataset(*map(jnp.asarray, columns), jnp.int32(len(rows)))
-
-
-def cart_model(std):
-    """The true cart, whose noise is known; the control is the first of its controls."""
-    apply = lambda posterior, draw, x, u: Prediction((A - np.eye(2)) @ x + B * u[0], jnp.asarray(std))  # noqa: E731
-    sample, loss = lambda key, posterior: jnp.zeros(()), lambda params, key, batch, context: batch
-    return Dynamics(None, lambda data: data.u, loss, lambda params, data: data.u, sample, apply)  # type: ignore[arg-type]
-
-
-def by_least_squares(data, rows, sensor, force, spread):
-    """Mean and covariance of the states [L + 1, 2] of one episode, from all its equations at once."""
-    x, u, length = np.asarray(data.x)[rows], np.asarray(data.u)[rows, 0], len(rows)
-    last = x[-1] + np.asarray(data.y)[rows[-1]]
-    equations, values = [], []
-
-    def add(at, left, right, std):
-        row = np.zeros(2 * (length + 1))
-        for t, part in zip(at, left, strict=True):
-            row[2 * t : 2 * t + 2] = part
-        equations.append(row / std)
-        values.append(right / std)
-
-    add([0], [[0, 1]], x[0, 1], np.sqrt(spread))
-    for t, position in enumerate([*x[:, 0], last[0]]):
-        add([t], [[1, 0]], position, sensor)
-    for t in range(length):
-        for i, std in enumerate((force * DT / 2, force)):
-            add([t, t + 1], [-A[i], np.eye(2)[i]], B[i] * u[t], std)
-    lhs, rhs = np.array(equations), np.array(values)
-    cov = np.linalg.inv(lhs.T @ lhs)
-    return (cov @ lhs.T @ rhs).reshape(-1, 2), cov
-
-
-def test_rates_are_drawn_as_model_and_positions_have_them(x64):
-    """Their mean and spread are those of the normal equations, whatever was drawn before. Unused rows stay."""
-    data, sensor, force = measured(), 0.03, 0.2
-    model = corrected(cart_model([sensor * np.sqrt(2), force]), rates=(1,), inputs=1)
-    assert model.prepare(data).shape == (9, 1)
-    draw = jax.jit(partial(draw_rates, dynamics=model, rates=(1,), angles=(), inputs=1, dt=DT))
-    rates = data.x[:7, 1]
-    for seed, before in enumerate((jnp.zeros((9, 2)), draw(jax.random.key(9), None, data, jnp.zeros((9, 2))))):
-        keys = jax.random.split(jax.random.key(seed), 4000)
-        found = np.asarray(jax.vmap(lambda key, before=before: draw(key, None, data, before))(keys))
-        np.testing.assert_array_equal(found[:, 7:], 0)
-        for rows in (range(4), range(4, 7)):
-            mean, cov = by_least_squares(data, list(rows), sensor, force, float(jnp.var(rates)))
-            drawn = np.asarray(data.x)[list(rows), 1] + found[:, list(rows), 0]
-            end = np.asarray(data.x + data.y)[rows[-1], 1] + found[:, rows[-1], 1]
-            whole = np.column_stack([drawn, end])
-            np.testing.assert_allclose(whole.mean(0), mean[:, 1], atol=0.01)
-            np.testing.assert_allclose(np.cov(whole.T), cov[1::2, 1::2], atol=0.002, rtol=0.1)
-
-
-def test_a_fit_sees_the_rates_that_were_drawn():
-    """At a row's beginning and its end; the controls are the model's own."""
-    model = corrected(cart_model([0.1, 0.1]), rates=(1,), inputs=1)
-    x, y, u = jnp.array([[1.0, 2.0]]), jnp.array([[0.5, 1.0]]), jnp.array([[7.0, 1.0, 0.25, -0.5]])
-    given = model.loss(None, jax.random.key(0), Batch(x, u, y), None)
-    np.testing.assert_allclose(np.concatenate(given, 1), [[1, 2.25, 7, 0.5, 0.25]])
-
-
-@pytest.mark.parametrize("steps", [1, 49, 50, 101, 130, 500])
-def test_a_fit_in_rounds_makes_all_its_updates(steps):
-    """Rates are as they were in its first tenth, and drawn in the rest."""
-    seen = []
-
-    def inner(key, learner, data, count):
-        jax.debug.callback(lambda drawn: seen.append((count, float(drawn))), data.u[0, -1], ordered=True)
-        return TrainState(learner.params + count, None), FitInfo(jnp.zeros(()), jnp.zeros(()), jnp.zeros((), int))
-
-    data = Dataset(*(jnp.zeros((3, size)) for size in (2, 2, 2)), jnp.int32(3))
-    draw = lambda key, params, data, before: jnp.ones((3, 2))  # noqa: E731
-    learner, _ = alternating(ModelLearner(None, inner), draw, 2).run(
-        jax.random.key(0), TrainState(jnp.int32(0), None), data, steps
-    )  # type: ignore[arg-type]
-    jax.effects_barrier()
-    assert int(learner.params) == sum(count for count, _ in seen) == steps
-    rounds = len(seen)
-    assert [drawn for _, drawn in seen] == [float(i >= 0.1 * (steps // 50 or 1)) for i in range(rounds)]
 
 
 ASKED = {  # by the names of its parameters, what a cost takes of a policy that remembers is asked for at each call

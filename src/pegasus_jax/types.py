@@ -106,6 +106,7 @@ class Dynamics(NamedTuple):
     moments: Callable[[Any, Array, Array], Any] | None = None
     # (keys [K], posterior) -> draws [K, ...]: the functions of K particles together; None: `sample`, vmapped
     deal: Callable[[Key, Any], Params] | None = None
+    penalty: Callable[[Params], Array] | None = None  # N times what the loss has beside the likelihood; None: unknown
 
 
 class Memory(NamedTuple):

@@ -13,7 +13,7 @@ from pegasus_jax import config as settings
 from pegasus_jax import episode, tasks
 from pegasus_jax.assembly.agreement import agree
 from pegasus_jax.assembly.own_pieces import try_dynamics, try_policy, try_task
-from pegasus_jax.assembly.pieces import drawing_rates, dynamics_of, fit_of, policy_of
+from pegasus_jax.assembly.pieces import dynamics_of, fit_of, policy_of
 from pegasus_jax.assembly.searchers import fresh_policies, limits, refines_successes, search_of
 from pegasus_jax.checks import ConfigError
 from pegasus_jax.config_used import check_config
@@ -111,7 +111,7 @@ def assembled(config: settings.Config, task: Task, mesh: Mesh | None, logged: in
     if policy is not None:
         try_policy(policy, task, follows=searcher is None)
     dynamics = dynamics or dynamics_of(config.model, task)
-    fitter = fitter or drawing_rates(fit_of(config.fit, dynamics), dynamics, task)
+    fitter = fitter or fit_of(config.fit, dynamics)
     if task.prior is not None:  # then all of that is of what the simulator gets wrong
         fitter = on_differences(fitter, task.prior, task.angles)
         dynamics = residual(dynamics, task.prior, angles=task.angles)

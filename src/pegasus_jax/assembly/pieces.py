@@ -17,9 +17,9 @@ from pegasus_jax.memory import given_size, seen_angles, seen_names
 from pegasus_jax.models import dropout
 from pegasus_jax.models.bnn import bnn
 from pegasus_jax.models.ensemble import ensemble
+from pegasus_jax.models.innovations import innovations, integrated
 from pegasus_jax.models.lagrangian import lagrangian
 from pegasus_jax.models.networks import HEADS
-from pegasus_jax.models.smoothed import alternating, corrected, draw_rates
 from pegasus_jax.pilco.gp import gp
 from pegasus_jax.pilco.lbfgs import full_data
 from pegasus_jax.pilco.rbf import rbf
@@ -48,15 +48,6 @@ def fit_of(config: settings.Fit | settings.LBFGS, dynamics: Dynamics) -> ModelLe
         return full_data(dynamics, num_starts=config.num_starts)
     rate = falling(config.learning_rate, config.decay, config.steps)
     return minibatches(dynamics, optax.adam(rate), batch_size=config.batch_size)
-
-
-def drawing_rates(fitter: ModelLearner, dynamics: Dynamics, task: Task) -> ModelLearner:
-    """The fitter of a task whose rates are not measured, which draws them by the model; of another one itself."""
-    if task.hindsight is None:
-        return fitter
-    inputs = given_size(task.memory, len(task.control_names))
-    known: dict[str, Any] = dict(rates=task.rates, angles=task.angles, inputs=inputs, dt=task.dt)
-    return alternating(fitter, partial(draw_rates, dynamics=dynamics, **known), 2 * len(task.rates))
 
 
 def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
@@ -93,11 +84,12 @@ def dynamics_of(config: settings.Model, task: Task) -> Dynamics:
             # What a good simulator gets wrong may be all noise.
             head = HEADS["sigmoid" if task.prior is None else "softplus"]
             member = bnn(**shape, **network_of(config), heteroscedastic=config.heteroscedastic, head=head)
+            if task.hindsight is not None:
+                member = integrated(member, rates=task.rates, dt=task.dt)
+    if task.hindsight is not None:
+        member = innovations(member, rates=task.rates, angles=task.angles, inputs=controls, dt=task.dt)
     size = several(config)
-    model = ensemble(member, size) if size > 1 else member
-    if task.hindsight is None:
-        return model
-    return corrected(model, rates=task.rates, inputs=controls)
+    return ensemble(member, size) if size > 1 else member
 
 
 def network_of(config: settings.BNN | settings.Lagrangian) -> dict[str, Any]:

@@ -91,4 +91,5 @@ def bnn(
         # The masks of one particle, w^(k) = g_2(w, z_w^(k)) (Alg. 3 line 9): all that differs between particles.
         sample=lambda key, posterior: network.sample(key, posterior.noise),
         apply=predict,
+        penalty=network.penalty,
     )

@@ -170,9 +170,12 @@ def lagrangian(
         predicted = jax.vmap(lambda masks, x, u: predict(Posterior(params, units), masks, x, u))(
             masks, batch.x, batch.u
         )
-        prior = weight_decay / 2 * sum(jnp.sum(params[name] ** 2) for name in ("control", "constant", "resistance"))
         likelihood = jax.scipy.stats.t.logpdf(batch.y, DEGREES_OF_FREEDOM, predicted.mean, predicted.std)
-        return -jnp.mean(jnp.sum(likelihood, -1)) + (network.penalty(params) + prior) / units.size
+        return -jnp.mean(jnp.sum(likelihood, -1)) + penalty(params) / units.size
+
+    def penalty(params: Params) -> Array:
+        prior = weight_decay / 2 * sum(jnp.sum(params[name] ** 2) for name in ("control", "constant", "resistance"))
+        return network.penalty(params) + prior
 
     return Dynamics(
         init=init,
@@ -181,6 +184,7 @@ def lagrangian(
         posterior=lambda params, data: Posterior(params, prepare(data)),
         sample=lambda key, posterior: network.sample(key, posterior.params["noise"]),
         apply=Vectorized(predict, together),
+        penalty=penalty,
     )
 
 

@@ -130,7 +130,7 @@ def smoothed(rows: Array, last: Array | int, controls: Array, *, task: Task) -> 
 
     Rates are those of polynomials through the positions around each row, Savitzky and Golay's, after the fact: a filter
     that runs on the robot knows only the rows before. Positions are as measured. The second value [H, 1] is 1 in the
-    row that begins the episode, and 0: a fit draws better rates along it (`models.smoothed`).
+    row that begins the episode, and 0: a fit filters along the rows behind it (`models.innovations`).
     """
     positions = np.array([i for i in range(len(task.state_names)) if i not in task.rates])
     turning = tuple(place for place, i in enumerate(positions) if i in task.angles)
