@@ -39,7 +39,6 @@ def call(*words: str, cwd: Path) -> subprocess.CompletedProcess[str]:
         ("[50,50],[200]", ["[50,50]", "[200]"]),
         ("1e-3,2e-3", ["1e-3", "2e-3"]),
         ("Pendulum-v1", ["Pendulum-v1"]),
-        ("3-1", []),
     ],
 )
 def test_values(text: str, found: list[str]) -> None:

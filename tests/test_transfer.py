@@ -267,7 +267,7 @@ def test_a_policy_that_sees_something_else_is_no_beginning(tmp_path):
     with pytest.raises(
         ConfigError,
         match=r"sees .*force \[N\] 1 before, and here .*goal 0; that run has control_rate=\[50\]"
-        r" and goal_low=\[\] and goal_high=\[\]: say",
+        r" and goal_low=\[\] and goal_high=\[\]: give",
     ):
         check.report(parse(init=str(limited), **words))
     for given in (

@@ -104,8 +104,7 @@ class Dynamics(NamedTuple):
     apply: Callable[[Any, Params, Array, Array], Prediction]
     # (posterior, mean [F + U], cov of (encoded state, control)) -> gaussian.Image of the change; None: not known
     moments: Callable[[Any, Array, Array], Any] | None = None
-    # (keys [K], posterior) -> draws [K, ...]: the functions of K particles together; None: `sample`, vmapped
-    deal: Callable[[Key, Any], Params] | None = None
+    deal: Callable[[Key, Any], Params] | None = None  # (keys [K], posterior) -> draws [K, ...]; None: `sample`, vmapped
     penalty: Callable[[Params], Array] | None = None  # N times what the loss has beside the likelihood; None: unknown
 
 
