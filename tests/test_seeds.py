@@ -112,6 +112,23 @@ def test_a_gpu_is_told_how_to_run_loops_unless_the_user_says(monkeypatch: pytest
     assert {*programs.compiler_options(programs.FAST_RUN)} == {abreast} | untuned
 
 
+CRASHES = """
+import jax, jax.numpy as jnp
+from pegasus_jax.runs import programs
+a, b = jax.random.normal(jax.random.key(0), (2, 3, 1, 2, 2, 8, 8, 8))
+summed = jax.jit(lambda a, b: jnp.sum(a * b, axis=3)).lower(a, b)
+for options in (programs.FAST_RUN, programs.FAST_COMPILE, programs.ONCE):
+    jax.block_until_ready(summed.compile(compiler_options=programs.compiler_options(options))(a, b))
+"""
+
+
+def test_a_reduction_of_many_dimensions_ends_no_process() -> None:
+    """As it does with some versions of the compiler for CPUs, where nothing is said."""
+    environment = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    run = subprocess.run([sys.executable, "-c", CRASHES], env=environment, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+
+
 @pytest.mark.slow
 def test_how_it_is_compiled_changes_no_result(monkeypatch: pytest.MonkeyPatch) -> None:
     """Graphs of kernels where these tests run on a GPU, wide vectors on a CPU. A few steps: rounding grows."""

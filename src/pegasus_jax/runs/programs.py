@@ -40,12 +40,15 @@ ON_GPU = GRAPHS | CONCURRENT_KERNELS | NO_AUTOTUNING
 # The compiler's options by platform. On a CPU what runs for milliseconds need not be compiled well: without
 # emitters it is ready in two thirds of the time, and a tenth slower. A fit or a search runs for seconds, and gains by
 # wide vectors; the compiler's highest level gains it nothing over the first, which takes a tenth less.
+# Newer versions fuse reductions into kernels of a library that crashes the process for arrays of seven dimensions and
+# more, such as those of several seeds with sensors.velocity= (github.com/jax-ml/jax/issues/39257): products only.
+NO_REDUCTIONS = {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT,LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT"}
 FAST_COMPILE: dict[str, dict] = {
-    "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
+    "cpu": NO_REDUCTIONS | {"xla_backend_optimization_level": 1, "xla_cpu_use_fusion_emitters": False},
     "gpu": ON_GPU,
 }
 FAST_RUN: dict[str, dict] = {
-    "cpu": {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512},
+    "cpu": NO_REDUCTIONS | {"xla_backend_optimization_level": 1, "xla_cpu_prefer_vector_width": 512},
     "gpu": ON_GPU,
 }
 # What runs once a trial, or a run: compiled in half of the time, it takes three times as long, some milliseconds more.
