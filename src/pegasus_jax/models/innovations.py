@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from pegasus_jax.math.angles import difference
+from pegasus_jax.models.lagrangian import DEGREES_OF_FREEDOM, coordinates_of
 from pegasus_jax.types import Array, Batch, Dataset, Dynamics, Key, Params, Prediction
 
 WINDOW = 25  # rows along which a filter runs
-DEGREES_OF_FREEDOM = 4.0  # of Student's t: a row that no model explains must not outweigh all others
 
 
 class Gaussian(NamedTuple):
@@ -84,7 +84,7 @@ def integrated(model: Dynamics, *, rates: tuple[int, ...], dt: float) -> Dynamic
 
     def apply(posterior: Params, draw: Params, x: Array, u: Array) -> Prediction:
         predicted = model.apply(posterior, draw, x, u)
-        positions = np.array([i for i in range(len(x)) if i not in rates])
+        positions = coordinates_of(len(x), rates)
         change = dt * (x[place] + predicted.mean[place] / 2)
         return predicted._replace(mean=predicted.mean.at[positions].set(change))
 
@@ -119,7 +119,7 @@ def innovation_nats(
     is in both of its ends. No gradient flows through the Jacobian of the model: that would take three times as long.
     """
     states, n, place = rows.x.shape[1], len(rates), np.array(rates)
-    positions = np.array([i for i in range(states) if i not in rates])
+    positions = coordinates_of(states, rates)
 
     def row(before: Gaussian, given: tuple[Batch, Array]) -> tuple[Gaussian, Array]:
         (x, u, y), begins = given

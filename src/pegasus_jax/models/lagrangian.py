@@ -68,7 +68,7 @@ def lagrangian(
     of those; `noise` describes the network, as `noisy` has it.
     """
     head = HEADS["sigmoid"]
-    coordinates = np.array([i for i in range(states) if i not in rates])
+    coordinates = coordinates_of(states, rates)
     moving = np.array(rates)
     n = len(coordinates)
     turning = tuple(i for i, coordinate in enumerate(coordinates) if coordinate in angles)
@@ -186,6 +186,11 @@ def lagrangian(
         apply=Vectorized(predict, together),
         penalty=penalty,
     )
+
+
+def coordinates_of(states: int, rates: tuple[int, ...]) -> np.ndarray:
+    """The entries [n] of a state that are no rates, in the order of their rates."""
+    return np.array([i for i in range(states) if i not in rates])
 
 
 def unit_of(w: Whitener) -> Array:
