@@ -127,6 +127,14 @@ def unfinished(path: Path) -> Path:
     return writable(path)
 
 
+def written(path: str | Path, by: str, parts: Callable[[Any], T]) -> T:
+    """The parts of a file that the module `by` of benchmarks wrote. Raises ConfigError for one without them."""
+    try:
+        return parts(json.loads(Path(path).read_text(encoding="utf-8")))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ConfigError(f"{path} is not what python -m benchmarks.{by} writes") from error
+
+
 def once(*words: object) -> list[str]:
     """The words of a command, which takes each once: of those that are there twice the last."""
     return list({word.partition("=")[0]: word for word in map(str, words)}.values())

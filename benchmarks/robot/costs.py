@@ -7,7 +7,6 @@ of 20 evaluation episodes, the total variation of their controls, and how far fr
 Tuning seeds are 100 to 119; 200 and above are for a final judgment only.
 """
 
-import json
 import shlex
 import time
 from collections.abc import Callable
@@ -20,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks import command, named, unfinished
+from benchmarks import command, named, unfinished, written
 from benchmarks.robot import asked
 from pegasus_jax import sharding
 from pegasus_jax.checks import ConfigError, did_you_mean
@@ -124,13 +123,10 @@ def run(name: str, config: Config, seeds: list[int], out: Path, told: dict[str, 
     return result
 
 
-def stored(path: Path) -> dict[str, Any]:
-    """What a file has. Raises ConfigError for one that is not of this command."""
-    try:
-        result = json.loads(path.read_text())
-        return {**result, "seconds": result["seconds"], "task": result["task"]}
-    except (ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"{path} is not what python -m benchmarks.robot.costs writes") from error
+def stored(file: str) -> dict[str, Any]:
+    """A result of this command. Raises ConfigError for another file."""
+    needed = lambda result: {**result, "seconds": result["seconds"], "task": result["task"]}  # noqa: E731
+    return written(file, "robot.costs", needed)
 
 
 def table(result: dict[str, Any]) -> str:
@@ -154,7 +150,7 @@ def main(words: list[str]) -> None:
     """The command line of this module; `show FILE.json ...` prints the tables again."""
     name, rest = named(words, f"one of {', '.join(TASKS)}")
     if name == "show":
-        print("\n".join(table(stored(Path(file))) for file in rest))
+        print("\n".join(table(stored(file)) for file in rest))
         return
     if name not in TASKS:
         raise ConfigError(f"{name} is unknown; {did_you_mean(name, TASKS)}")

@@ -6,11 +6,10 @@ Fails when a row that both have has become slower by more than LIMIT, or when th
 be held against a full one. Both must have been made with as many CPUs.
 """
 
-import json
 from pathlib import Path
 from typing import Any
 
-from benchmarks import RESULTS, command
+from benchmarks import RESULTS, command, written
 from pegasus_jax.checks import ConfigError
 
 STORED = RESULTS / "speed.json"
@@ -27,11 +26,7 @@ def ratios(new: Rows, stored: Rows) -> dict[str, float]:
 
 def read(path: str | Path) -> dict[str, Any]:
     """A run of the suite. Raises ConfigError for another file."""
-    try:
-        run = json.loads(Path(path).read_text())
-        return {"rows": dict(run["rows"]), "about": dict(run["about"])}
-    except (ValueError, KeyError, TypeError) as error:
-        raise ConfigError(f"{path} is not what python -m benchmarks.speed.suite writes") from error
+    return written(path, "speed.suite", lambda run: {"rows": dict(run["rows"]), "about": dict(run["about"])})
 
 
 def main(words: list[str]) -> int:
