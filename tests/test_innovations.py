@@ -12,7 +12,7 @@ from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.config import BNN, Lagrangian, Sensors
 from pegasus_jax.models.bnn import bnn
 from pegasus_jax.models.dropout import binary
-from pegasus_jax.models.innovations import DEGREES_OF_FREEDOM, WINDOW, innovation_nats, innovations, integrated, windows
+from pegasus_jax.models.innovations import DEGREES_OF_FREEDOM, WINDOW, filtered, innovations, integrated, windows
 from pegasus_jax.models.lagrangian import lagrangian
 from pegasus_jax.types import Batch, Dataset, Prediction
 from probes import cart, tiny
@@ -37,10 +37,10 @@ def measured(lengths=(4, 3), capacity=9, seed=0, rates=0.5):
 
 
 def along(predict, data, spread, angles=()):
-    """`innovation_nats` of all rows in use, as one window."""
+    """`filtered(...).nats` of all rows in use, as one window."""
     rows = int(data.size)
     given = Batch(data.x[:rows], data.u[:rows, :1], data.y[:rows])
-    return innovation_nats(predict, given, data.u[:rows, 1] > 0.5, spread, rates=(1,), angles=angles, dt=DT)
+    return filtered(predict, given, data.u[:rows, 1] > 0.5, spread, rates=(1,), angles=angles, dt=DT).nats
 
 
 def cart_of(std, gain=1.0):
@@ -96,14 +96,16 @@ def test_positions_that_are_measured_together_are_measured_one_after_the_other(x
     x, y, spread = draw.normal(size=(1, 4)), draw.normal(size=(1, 4)), np.array([0.5, 0.8])
     predict = lambda x, u: Prediction(slopes @ x, std)  # noqa: E731
     rows = Batch(*map(jnp.asarray, (x, np.zeros((1, 1)), y)))
-    found = innovation_nats(predict, rows, jnp.array([True]), jnp.asarray(spread), rates=(1, 3), angles=(), dt=DT)
+    found = filtered(predict, rows, jnp.array([True]), jnp.asarray(spread), rates=(1, 3), angles=(), dt=DT)
     start = np.diag([std[0] ** 2 / 2, spread[0], std[2] ** 2 / 2, spread[1]])
     moved = np.diag([(DT / 2 * std[1]) ** 2, std[1] ** 2, (DT / 2 * std[3]) ** 2, std[3] ** 2])
     onward = np.eye(4) + slopes
     cov = (onward @ start @ onward.T + moved)[::2, ::2] + np.diag(std[::2] ** 2 / 2)
     apart = (y - slopes @ x[0])[0, ::2]
     v, far = DEGREES_OF_FREEDOM, apart @ np.linalg.solve(cov, apart)
-    np.testing.assert_allclose(found[0], np.linalg.slogdet(cov)[1] / 2 + (v + 2) / 2 * np.log1p(far / v), rtol=1e-9)
+    np.testing.assert_allclose(found.nats[0], np.linalg.slogdet(cov)[1] / 2 + (v + 2) / 2 * np.log1p(far / v), rtol=1e-9)
+    np.testing.assert_allclose(found.error[0], apart, rtol=1e-9)
+    np.testing.assert_allclose(found.variance[0], np.diag(cov), rtol=1e-9)
 
 
 def test_an_angle_that_crosses_half_a_turn_has_not_jumped(x64):
@@ -140,8 +142,8 @@ def test_single_precision_leaves_no_variance_below_zero(seed):
         predict = lambda x, u: Prediction(jnp.asarray(slopes, kind) @ x, jnp.asarray(std, kind))  # noqa: E731
         given = [jnp.asarray(rows, kind) for rows in (x, np.zeros((400, WINDOW, 1)), y)]
         variance, begins = jnp.full(2, 100, kind), jnp.zeros(WINDOW, bool)
-        along = partial(innovation_nats, predict, rates=(1, 3), angles=(), dt=0.02)
-        return jax.jit(jax.vmap(lambda *rows: along(Batch(*rows), begins, variance)))(*given)
+        along = partial(filtered, predict, rates=(1, 3), angles=(), dt=0.02)
+        return jax.jit(jax.vmap(lambda *rows: along(Batch(*rows), begins, variance).nats))(*given)
 
     single = of(np.float32)
     with jax.enable_x64(True):

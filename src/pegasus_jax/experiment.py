@@ -1,6 +1,7 @@
 """Alg. 1: `collect` runs an episode on the plant, `add_episode` stores it, `improve` fits and searches."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,7 @@ from pegasus_jax.learn import data as dataset
 from pegasus_jax.learn.fit import FitInfo
 from pegasus_jax.learn.gradient import SearchInfo
 from pegasus_jax.learn.successor import after_episode, came_back
-from pegasus_jax.models.calibration import calibration
+from pegasus_jax.models.calibration import calibration, filtered_errors, one_step_errors
 from pegasus_jax.policies.driver import driver
 from pegasus_jax.policies.rate_limited import before, explored, with_state
 from pegasus_jax.shapes import check_trajectory
@@ -305,7 +306,10 @@ def experiment(
         posterior = posterior_of(state)
         key = trial_key(state.key, state.trial + 1, CALIBRATE)
         ran, _ = as_modeled(trajectory)
-        found = calibration(key, posterior, ran._replace(u=ran.u[:, :inputs]), dynamics=dynamics, angles=task.angles)
+        ran = ran._replace(u=ran.u[:, :inputs])
+        by_positions = task.hindsight is not None
+        errors = partial(filtered_errors, rates=task.rates, dt=task.dt) if by_positions else one_step_errors
+        found = calibration(key, posterior, ran, dynamics=dynamics, angles=task.angles, errors=errors)
         return jnp.where(state.trial >= first_search, found, jnp.nan)
 
     return Experiment(

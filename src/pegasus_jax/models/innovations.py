@@ -22,6 +22,14 @@ class Gaussian(NamedTuple):
     cov: Array  # [D, D]
 
 
+class Innovations(NamedTuple):
+    """What a filter says of the positions measured at the ends of W consecutive rows."""
+
+    error: Array  # [W, n] the measured positions less the predicted ones
+    variance: Array  # [W, n] predicted for these
+    nats: Array  # [W] negative log likelihood of the row's positions, given those before
+
+
 class Context(NamedTuple):
     """What the loss needs to know of the data set as a whole."""
 
@@ -62,7 +70,7 @@ def innovations(
         def of_window(draw: Params, rows: Batch) -> Array:
             predict, begins = partial(model.apply, posterior, draw), rows.u[:, inputs] > 0.5
             rows = rows._replace(u=rows.u[:, :inputs])
-            return innovation_nats(predict, rows, begins, context.rate_variance, rates=rates, angles=angles, dt=dt)
+            return filtered(predict, rows, begins, context.rate_variance, rates=rates, angles=angles, dt=dt).nats
 
         return jnp.mean(jax.vmap(of_window)(draws, drawn)) + penalty(params) / context.data.size
 
@@ -101,7 +109,7 @@ def windows(key: Key, data: Dataset, rows: int) -> Batch:
     return Batch(*(jnp.asarray(values)[index] for values in (data.x, data.u, data.y)))
 
 
-def innovation_nats(
+def filtered(
     predict: Callable[[Array, Array], Prediction],
     rows: Batch,
     begins: Array,
@@ -110,18 +118,18 @@ def innovation_nats(
     rates: tuple[int, ...],
     angles: tuple[int, ...],
     dt: float,
-) -> Array:
-    """[W] of consecutive rows: the negative log likelihood of the positions at a row's end, given those before [nats].
+) -> Innovations:
+    """The innovations of an extended Kalman filter along W consecutive rows, with `predict(x, u)` as its model.
 
-    The likelihood is Student's t of the innovations of an extended Kalman filter, without its constant. The filter
-    starts in the first row, and where an episode `begins` [W], at the measured positions and the computed rates with
-    `rate_variance` [n]. Half of the variance that `predict(x, u)` has for a change of position is sensor noise, which
-    is in both of its ends. No gradient flows through the Jacobian of the model: that would take three times as long.
+    Their likelihood is Student's t, without its constant. The filter starts in the first row, and where an episode
+    `begins` [W], at the measured positions and the computed rates with `rate_variance` [n]. Half of the variance that
+    `predict` has for a change of position is sensor noise, which is in both of its ends. No gradient flows through the
+    Jacobian of the model: that would take three times as long.
     """
     states, n, place = rows.x.shape[1], len(rates), np.array(rates)
     positions = coordinates_of(states, rates)
 
-    def row(before: Gaussian, given: tuple[Batch, Array]) -> tuple[Gaussian, Array]:
+    def row(before: Gaussian, given: tuple[Batch, Array]) -> tuple[Gaussian, Innovations]:
         (x, u, y), begins = given
         mean = jnp.where(begins, x, before.mean)
         change, std = predict(mean, u)
@@ -133,7 +141,9 @@ def innovation_nats(
         start = jnp.diag(jnp.zeros_like(x).at[place].set(rate_variance).at[positions].set(sensor))
         cov = transition @ jnp.where(begins, start, before.cov) @ transition.T + jnp.diag(process)
         predicted = Gaussian(mean + change, cov)
-        return updated(predicted, difference(x + y, predicted.mean, angles)[positions], sensor)
+        error = difference(x + y, predicted.mean, angles)[positions]
+        after, nats = updated(predicted, error, sensor)
+        return after, Innovations(error, jnp.diag(cov)[positions] + sensor, nats)
 
     def updated(predicted: Gaussian, innovation: Array, sensor: Array) -> tuple[Gaussian, Array]:
         """The belief after the measured positions, one after the other, and the negative log likelihood of these."""
