@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pegasus_jax.assembly.experiments import compose
-from pegasus_jax.models.calibration import calibration
+from pegasus_jax.models.calibration import calibration, filtered_errors
 from pegasus_jax.types import Dynamics, Prediction, Trajectory
 from probes import PENDULUM, PLAIN, cart, experience, known, network, noisy_linear_policy, regression, same, tiny
 
@@ -43,6 +43,28 @@ def test_a_model_whose_predictions_are_the_truth_is_calibrated(function_std, noi
 def test_calibration_is_proportional_to_the_errors(factor):
     model = uncertain(0.0, 0.5)
     assert found(model, episode(0.5 * factor)) == pytest.approx(factor * found(model, episode(0.5)), rel=1e-4)
+
+
+@pytest.mark.parametrize("factor", [1.0, 3.0])
+def test_of_positions_alone_errors_of_computed_rates_do_not_count(factor):
+    """A cart under noise `factor` times as large as its model says; its rates are differences."""
+    dt, sensor, force, steps = 0.3, 0.03, 0.2, 2000
+    a, b, draw = np.array([[1, dt], [0, 1]]), np.array([dt**2 / 2, dt]), np.random.default_rng(0)
+    x, u = [np.zeros(2)], draw.uniform(-2, 2, steps)
+    for control in u:
+        x.append(a @ x[-1] + b * control + factor * force * draw.normal(size=2) * [dt / 2, 1])
+    seen = np.array(x)[:, 0] + factor * sensor * draw.normal(size=steps + 1)
+    rows = np.stack([seen, np.append(0, np.diff(seen)) / dt], 1)
+    model = uncertain(0.0, 0.0)._replace(
+        apply=lambda posterior, draw, x, u: Prediction(
+            (a - np.eye(2)) @ x + b * u[0], jnp.array([sensor * np.sqrt(2), force])
+        )
+    )
+    trajectory = Trajectory(jnp.asarray(rows, float), jnp.asarray(u[:, None], float), jnp.zeros(steps))
+    by_filter = partial(filtered_errors, rates=(1,), dt=dt)
+    ask = partial(calibration, posterior=None, trajectory=trajectory, dynamics=model, angles=(), draws=2)
+    assert float(ask(jax.random.key(0), errors=by_filter)) == pytest.approx(factor, rel=0.06)
+    assert float(ask(jax.random.key(1))) > 1.5 * factor
 
 
 def test_a_few_wild_steps_do_not_decide():
