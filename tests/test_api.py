@@ -689,6 +689,7 @@ WRONG_TASKS = [
     (dict(starts=[[1.0]]), r"the task's starts has shape \(1, 1\); expected \(N, 2\)"),
     (dict(starts_std=[1.0]), r"the task's starts_std has shape \(1,\); expected \(2,\)"),
     (dict(success="low"), r"the task's success=low is no number"),
+    (dict(stop_cost=None), r"the task's stop_cost=null is no number; expected a cost a step, as 1\.0"),
     (dict(constraint=lambda x: x[0]), r"the task's constraint is of type function; expected .*Constraint\(of_state, "),
     (
         dict(constraint=Constraint(lambda x: jnp.zeros((2, 2)))),

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pegasus_jax.assembly.schedules import rounds_from, width_for
+from pegasus_jax.checks import ConfigError
 from pegasus_jax.imagine.matching import either
 from pegasus_jax.learn.schedule import (
     COARSE,
@@ -38,6 +39,12 @@ def test_the_plain_table_is_the_printed_algorithm():
     table = search_table(4)
     assert not table.refine.any()
     assert all(np.array_equal(factor, np.ones((1, 4))) for factor in table[-3:])
+
+
+@pytest.mark.parametrize("refine", [-1, 5, [2, 9]])
+def test_a_refinement_begins_within_the_search(refine):
+    with pytest.raises(ConfigError, match=r"^refine=(-1|5|9) is out of range; expected a number in \[0, 4\]"):
+        search_table(4, refine=refine)
 
 
 def test_a_search_starts_from_the_policy_it_is_told():

@@ -184,6 +184,12 @@ def test_a_known_control_is_found_through_limits_and_costs(optimizer):
     np.testing.assert_allclose(2 * jnp.tanh(learner.params), best, atol=5e-3)
 
 
+def test_a_misspelt_argument_of_the_plain_search_is_named():
+    how = dict(objective=None, sampler=None, optimizer=None, steps=1)
+    with pytest.raises(TypeError, match=r"^gradient_search has no argument frist="):
+        gradient_search(jax.random.key(0), TrainState(None, None), None, **how, earlier=0, frist=3)
+
+
 # The optimizer, on an objective simple enough to follow by hand: |params - scenarios|^2
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import re
 import struct
 from collections.abc import Iterator
@@ -48,6 +49,12 @@ def events(run: Path) -> Iterator[Any]:
             (length,) = struct.unpack("<Q", data[:8])
             yield Event.FromString(data[12 : 12 + length])
             data = data[16 + length :]
+
+
+@pytest.mark.filterwarnings("error::ResourceWarning", "error::pytest.PytestUnraisableExceptionWarning")
+def test_tensorboard_leaves_no_file_open(run: Path) -> None:
+    learned(run, range(1, 2), ("tensorboard",))
+    gc.collect()  # a file that is still open warns when it is collected
 
 
 def test_tensorboard_has_numbers_settings_and_pictures(run: Path) -> None:

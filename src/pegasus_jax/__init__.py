@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pegasus_jax.exports.write import export as export
     from pegasus_jax.imagine import costs as costs
     from pegasus_jax.imagine import matching as matching
+    from pegasus_jax.imagine.limits import Constraint as Constraint
     from pegasus_jax.imagine.objective import objective as objective
     from pegasus_jax.imagine.rollout import NoiseUse as NoiseUse
     from pegasus_jax.imagine.rollout import rollout as rollout
@@ -124,6 +125,7 @@ _NAMES = {
     "pilco.rbf": "rbf",
     # the values that pass between them
     "task": "Task Signal",
+    "imagine.limits": "Constraint",
     "types": "Cost Trajectory Dataset Batch Dynamics Prediction Dropout Policy Memory Hindsight Scenarios"
     " Period Rollout TrainState ModelLearner PolicyOptimizer RunState",
     "vectorized": "Vectorized",

@@ -111,9 +111,10 @@ def checked(task: Task) -> Task:
     dt: Any = task.dt
     if not isinstance(dt, Tracer) and not (isinstance(dt, float | int | np.number | np.ndarray) and 0 < dt < np.inf):
         raise ConfigError(f"the task's dt={shown(dt)} is no control period; expected a number of seconds above 0")
-    success: Any = task.success
-    if not isinstance(success, float | int | np.number | np.ndarray | Array) or np.ndim(success):
-        raise ConfigError(f"the task's success={shown(success)} is no number; expected a cost a step, as 0.2")
+    for name, example in (("success", "0.2"), ("stop_cost", "1.0")):
+        cost: Any = getattr(task, name)
+        if not isinstance(cost, float | int | np.number | np.ndarray | Array) or np.ndim(cost):
+            raise ConfigError(f"the task's {name}={shown(cost)} is no number; expected a cost a step, as {example}")
     if not any(isinstance(limit, Tracer) for limit in (task.control_low, task.control_high)):
         for name, low, high in zip(task.control_names, task.control_low, task.control_high, strict=True):
             if not low < high:

@@ -31,15 +31,18 @@ def gradient_search(
     optimizer: optax.GradientTransformation,
     steps: int,
     first: Array | int = 0,
-    **_others: Any,
+    **others: Any,
 ) -> tuple[TrainState, SearchInfo]:
     """Alg. 3 as printed: `steps` updates along the gradient of `objective` under the scenarios of each iteration.
 
     The learner holds policy parameters and `optimizer.init` of them. `optimizer` includes the clip of lines 17 and 18:
     optax.chain(optax.clip_by_global_norm(1.0), optax.adam(1e-3)). An update is skipped where the objective or its
     gradient is not finite. Arrays of the information have an entry a step, [N]. `first` iterations of the search are
-    done already. The other arguments that a trial gives its searcher, `earlier`, `fresh` and `works`, are ignored.
+    done already. A trial also gives its searcher `earlier`, `fresh` and `works`, which are ignored here. Raises
+    TypeError for others.
     """
+    if unknown := {*others} - {"earlier", "fresh", "works"}:
+        raise TypeError(f"gradient_search has no argument {min(unknown)}=")
 
     def step(carry: tuple[TrainState, Scenarios], i: Array) -> tuple[tuple[TrainState, Scenarios], SearchInfo]:
         learner, scenarios = carry

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from pegasus_jax.checks import choice
+from pegasus_jax.checks import check_range, choice
 from pegasus_jax.config import INITS
 from pegasus_jax.math.decay import half_cosine
 
@@ -54,7 +54,7 @@ def search_table(
     """The table of searches of `steps` iterations each.
 
     init: what a search starts from: the `previous` policy, a `fresh` one, the `better` of both, or of both after a race
-    of RACED of the iterations before `refine` each (`raced`; the `better` where that is none); else a ConfigError.
+    of RACED of the iterations before `refine` each (`raced`; the `better` where that is none).
     refine: the iteration from which it refines the better of what it found and what it was given, or those with which
     rounds of that begin, each of which may be the last (learn/rounds.py); None: never.
     cost_width_start: the cost's width at the start; it falls to 1, geometrically, by half of the coarse iterations.
@@ -62,9 +62,13 @@ def search_table(
     anneal_trials: searches over which width and step size fall once.
     warm_restart, warm_limit_factor: after those each search's step size falls from `warm_restart` to `decay` of it,
     under `warm_limit_factor` times the limit; with warm_restart=0 both stay as they are.
+
+    Raises ConfigError for another `init`, and for a `refine` that is not from 0 to `steps`.
     """
     choice("init", init, INITS)
     bounds = [] if refine is None else sorted({*np.atleast_1d(refine).tolist(), steps})
+    for begins in bounds:
+        check_range("refine", begins, 0, steps)
     race = int(RACED * bounds[0]) if bounds and init == "raced" else 0  # iterations of each policy of a race
     compares = init == "better" or (init == "raced" and not race)
     rows = [(0, 0, EVALUATE, CURRENT), (0, 0, EVALUATE, FRESH)] if compares else []

@@ -47,6 +47,16 @@ class Board:
         image = Summary.Image(height=height, width=width, colorspace=4, encoded_image_string=encoded)
         self._summaries(trial, [Summary(value=[Summary.Value(tag=name, image=image)])])
 
+    def close(self) -> None:
+        """Nothing more is added."""
+        if self._writer is None:
+            return
+        try:
+            self._writer.close()
+        except OSError as error:
+            self._stop(error)
+        self._writer = None
+
     def _summaries(self, step: int, summaries: list[Any]) -> None:
         self._write([Event(wall_time=time.time(), step=step, summary=summary) for summary in summaries])
 

@@ -44,7 +44,7 @@ def tensorboard(opening: Opening) -> Tracker:
 
     board = Board(opening.run / "tensorboard", opening.first, opening.say)
     board.settings(opening.settings)
-    return Tracker({}, lambda row: board.add(row["trial"], numbers(row)), board.picture, lambda: None)
+    return Tracker({}, lambda row: board.add(row["trial"], numbers(row)), board.picture, board.close)
 
 
 def wandb(opening: Opening) -> Tracker:
