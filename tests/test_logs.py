@@ -492,6 +492,8 @@ def test_a_bag_is_read_by_topics_and_fields(bag):
         (("x=/joint.position.0", *TOPICS[1:]), "did you mean '/joints'"),
         (("x=/joints.position.7", *TOPICS[1:]), "/joints.position.7 is no number"),
         (("x=/joints.header", *TOPICS[1:]), "/joints.header is no number"),
+        (("t=/joints.position.0", *TOPICS), "names t, and a bag has the times of its messages; leave it out"),
+        (("episode=/force.data", *TOPICS), "names episode, and a bag has the times"),
     ):
         with pytest.raises(ConfigError, match=part):
             read([str(bag)], CART, columns)

@@ -10,7 +10,7 @@ import numpy as np
 from pegasus_jax.checks import ConfigError, did_you_mean
 from pegasus_jax.logs.columns import SETTING, mapped
 from pegasus_jax.logs.episodes import interpolated
-from pegasus_jax.logs.table import Names, Table, reason
+from pegasus_jax.logs.table import EPISODE, Names, Table, reason
 
 SUFFIXES = (".mcap", ".db3", ".bag")
 Series = tuple[np.ndarray, np.ndarray]  # times [s], values
@@ -22,7 +22,7 @@ def of_bag(path: Path, names: Names, columns: Sequence[str], control: str = "sen
     The map says of each entry a topic and a field, as /joint_states.position.0. Times are when messages were recorded.
     Other observations are interpolated linearly to the rows' times, and controls are those held in the middle of the
     period after a row, or before it where `control` is "before": a loop sends one a little after it has read. Raises
-    ConfigError for topics and fields that are not there.
+    ConfigError for topics and fields that are not there, and for a map that names t or episode.
     """
     try:
         from rosbags.highlevel import AnyReader
@@ -30,6 +30,9 @@ def of_bag(path: Path, names: Names, columns: Sequence[str], control: str = "sen
     except ImportError as error:
         raise ConfigError(f"data={path} needs rosbags: pip install 'pegasus-jax[logs]'") from error
     said = mapped(columns, names)
+    for name in ("t", EPISODE):
+        if name in said and name not in names.observation:
+            raise ConfigError(f"{path}: {SETTING} names {name}, and a bag has the times of its messages; leave it out")
     try:
         with AnyReader([whole(path)], default_typestore=get_typestore(Stores.LATEST)) as bag:
             if not said:
