@@ -215,6 +215,7 @@ FORMS = {
     "github-workflows": "workflows/*.yml",
     "github-issue-forms": "ISSUE_TEMPLATE/[!c]*.yml",
     "github-issue-config": "ISSUE_TEMPLATE/config.yml",
+    "dependabot": "dependabot.yml",
     "citation-file-format": "../CITATION.cff",
 }
 
@@ -248,6 +249,9 @@ def test_issues_ask_for_the_versions_and_containers_are_of_files_that_are_there(
         assert "Output of `pegasus-train --version --verbose`" in asked
     container = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
     assert "make setup" in container["postCreateCommand"]
+    system = r"apt-get install -y (?:--no-install-recommends )?([\w -]+?)(?: &&|$)"
+    (of_ci,) = re.findall(system, (ROOT / ".github" / "workflows" / "ci.yml").read_text(), re.MULTILINE)
+    assert re.findall(system, container["postCreateCommand"]) == [of_ci]
     assert re.findall(r'^CMD \["(\S+)"', (ROOT / "Dockerfile").read_text(), re.MULTILINE) == ["pegasus-train"]
     cited = {*re.findall(r"@(\w+20\d\d|\w+18)", (ROOT / "paper.md").read_text())}
     assert cited == {*re.findall(r"^@\w+\{(\w+),", (ROOT / "paper.bib").read_text(), re.MULTILINE)}
