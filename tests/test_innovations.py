@@ -8,9 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from pegasus_jax import memory as recall
 from pegasus_jax.assembly.experiments import compose
 from pegasus_jax.config import BNN, Lagrangian, Sensors
+from pegasus_jax.experiment import CALIBRATE, trial_key
 from pegasus_jax.models.bnn import bnn
+from pegasus_jax.models.calibration import calibration, filtered_errors
 from pegasus_jax.models.dropout import binary
 from pegasus_jax.models.innovations import DEGREES_OF_FREEDOM, WINDOW, filtered, innovations, integrated, windows
 from pegasus_jax.models.lagrangian import lagrangian
@@ -214,7 +217,10 @@ def test_a_model_that_does_not_say_its_penalty_is_refused():
 
 @pytest.mark.parametrize("model", [BNN(hidden=(20,), ensemble_size=2), Lagrangian(hidden=(20,), ensemble_size=1)])
 def test_a_fit_to_positions_finds_what_a_force_does(model):
-    """Through the whole experiment: the change of the rate by the control, of rates that were never measured."""
+    """Through the whole experiment: the change of the rate by the control, of rates that were never measured.
+
+    Its errors in the next episode are those of positions, through the filter.
+    """
     sensors = Sensors(measured=(0,), velocity="difference")
     config = replace(tiny(trials=8, sensors=sensors, explore__trials=8), model=model)
     exp = compose(config, cart(25))
@@ -232,3 +238,11 @@ def test_a_fit_to_positions_finds_what_a_force_does(model):
         return float(jnp.mean(jax.vmap(of_draw)(draws)))
 
     assert (change(1.0) - change(-1.0)) / 2 == pytest.approx(0.3, rel=0.15)
+
+    ran = exp.collect(state)
+    (x, _), m = exp.task.hindsight.states(ran.x, 25, ran.u), recall.replay(exp.task.memory, ran)
+    seen = ran._replace(x=x, u=jax.vmap(recall.steps(exp.task.memory)[1])(m[:-1], ran.u))
+    ask = partial(calibration, trial_key(state.key, state.trial + 1, CALIBRATE), posterior, seen)
+    by_filter = partial(filtered_errors, rates=(1,), dt=exp.task.dt)
+    of_positions = ask(dynamics=exp.dynamics, angles=(), errors=by_filter)
+    assert float(exp.calibrate(state, ran)) == pytest.approx(float(of_positions), rel=1e-3)
