@@ -18,7 +18,7 @@ ROOT = Path(__file__).parents[1]
 GROUPS = {
     "A run": ("config", "start", "logs.read", "runs.controller", "exports.write", "math.delays", "checks"),
     "An experiment": ("assembly.experiments", "assembly.pieces", "experiment", "episode", "task", "vectorized"),
-    "Imagination": ("imagine.scenarios", "imagine.rollout", "imagine.objective"),
+    "Imagination": ("imagine.scenarios", "imagine.rollout", "imagine.objective", "imagine.limits"),
     "Fit and search": ("learn.fit", "learn.gradient", "learn.search", "learn.rounds", "learn.schedule", "learn.visits"),
     "Models": ("models.bnn", "models.ensemble", "models.lagrangian", "pilco.gp", "pilco.ssgp"),
     "Policies": ("policies.mlp", "policies.linear", "policies.wrap", "pilco.rbf"),
