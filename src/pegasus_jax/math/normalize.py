@@ -16,14 +16,14 @@ class Whitener(NamedTuple):
     inverse: Array  # [F, F] root's inverse
 
 
-def whitener(rows: Array, size: Array, *, full: bool = True, jitter: float = 1e-6) -> Whitener:
+def whitener(rows: Array, size: Array, *, full: bool = True) -> Whitener:
     """The whitener of the first `size` rows of rows [N, F] (docs/reference.md 4.6).
 
     With `full`, the root is the Cholesky factor of the rows' covariance; otherwise it is diagonal. The covariance is
     that of the rows and of one more row whose columns are uncorrelated: a few rows, such as an episode that ends after
-    seven steps, cannot tell a correlation of 1 from one of nearly 1, and whitening enlarges the difference. `jitter` is
-    relative to each column's variance and keeps columns that hardly vary (an angle before it has moved) invertible. A
-    column that those before it determine is scaled alone, see `independent`.
+    seven steps, cannot tell a correlation of 1 from one of nearly 1, and whitening enlarges the difference. A millionth
+    of each column's variance keeps columns that hardly vary (an angle before it has moved) invertible. A column that
+    those before it determine is scaled alone, see `independent`.
     """
     used = (jnp.arange(rows.shape[0]) < size)[:, None]
     count = jnp.maximum(size, 1).astype(rows.dtype)
@@ -39,12 +39,12 @@ def whitener(rows: Array, size: Array, *, full: bool = True, jitter: float = 1e-
     free = independent(products / count)
     correlation = (products + identity) / (count + 1)
     correlation = jnp.where(free[:, None] & free, correlation, identity)
-    root = jnp.linalg.cholesky(correlation + jitter * identity)
+    root = jnp.linalg.cholesky(correlation + 1e-6 * identity)
     inverse = jnp.linalg.inv(root)
     return Whitener(mean, scale[:, None] * root, inverse / scale)
 
 
-def independent(correlation: Array, least: float = 1e-4) -> Array:
+def independent(correlation: Array) -> Array:
     """Whether less than all of each column [F] follows linearly from the columns before it, given their correlation.
 
     What does not follow, the pivot of an elimination, is a fraction of the column's variance. Whitening would enlarge
@@ -56,7 +56,7 @@ def independent(correlation: Array, least: float = 1e-4) -> Array:
     def eliminate(j: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         rest, free = carry
         pivot = rest[j, j]
-        kept = pivot >= least
+        kept = pivot >= 1e-4
         column = jnp.where(kept, rest[:, j], 0)
         return rest - jnp.outer(column, column) / jnp.where(kept, pivot, 1), free.at[j].set(kept)
 
