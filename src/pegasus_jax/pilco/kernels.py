@@ -92,14 +92,14 @@ def hyper(params: Params) -> Hyper:
     return Hyper(jnp.exp(params["log_lengthscale"]), signal, noise)
 
 
-def penalty(h: Hyper, *, ratio: float = 1000, reach: float = 100, exponent: int = 30) -> Array:
+def penalty(h: Hyper) -> Array:
     """A wall around hyperparameters that no data justify (docs/reference.md 6), summed over outputs.
 
-    Signal-to-noise ratios beyond `ratio` or 1 / `ratio`, and length scales beyond `reach` or 1 / `reach` standard
-    deviations of the data; nothing of it is felt inside.
+    Signal-to-noise ratios beyond 1000 or 1 / 1000, and length scales beyond 100 or 1 / 100 standard deviations of the
+    data; nothing of it is felt inside.
     """
-    noise = (jnp.log(h.signal / h.noise) / np.log(ratio)) ** exponent
-    length = (jnp.log(h.lengthscale) / np.log(reach)) ** exponent
+    noise = (jnp.log(h.signal / h.noise) / np.log(1000)) ** 30
+    length = (jnp.log(h.lengthscale) / np.log(100)) ** 30
     return jnp.sum(noise) + jnp.sum(length)
 
 
