@@ -209,18 +209,18 @@ def gently(plan: Array, amplitude: float, low: Array, high: Array) -> Array:
     return rest + amplitude * jnp.linspace(0.2, 1.0, len(plan))[:, None] * (plan - rest)
 
 
-def random_walk(key: Key, low: Array, high: Array, horizon: int, move: float = 0.3, pull: float = 0.75) -> Array:
-    """Random controls [H, U]: with probability `move` a step goes `pull` of the way to a fresh uniform draw.
+def random_walk(key: Key, low: Array, high: Array, horizon: int) -> Array:
+    """Random controls [H, U]: with probability 0.3 a step goes 0.75 of the way to a fresh uniform draw.
 
     The exploration of the authors' swimmer scripts (docs/reference.md 3.4).
     """
     fresh_key, move_key = jax.random.split(key)
     fresh = uniform(fresh_key, low, high, horizon)
-    moves = jax.random.bernoulli(move_key, move, (horizon,)).at[0].set(True)
+    moves = jax.random.bernoulli(move_key, 0.3, (horizon,)).at[0].set(True)
 
     def step(u: Array, draw: tuple[Array, Array]) -> tuple[Array, Array]:
         target, moved = draw
-        u = jnp.where(moved, u + pull * (target - u), u)
+        u = jnp.where(moved, u + 0.75 * (target - u), u)
         return u, u
 
     return jax.lax.scan(step, fresh[0], (fresh, moves))[1]
