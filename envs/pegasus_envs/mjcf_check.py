@@ -18,20 +18,20 @@ MOST = 0.8  # of the periods: contacts alone made 3 in 10 differ, of an ant
 SMALL = 1e-2  # a change that is less is not judged: there the solvers' own tolerances are
 
 
-def compare(made: mjcf_plant.Mechanism, periods: int = PERIODS, seed: int = 0) -> None:
+def compare(made: mjcf_plant.Mechanism) -> None:
     """Raises ValueError, in one line, where MJX's physics of a mechanism is not that of C MuJoCo, or not finite.
 
     Each control period of one episode of random controls is done twice from C MuJoCo's state, so that chaos has no time
     to grow: a period differs where the change of an entry does, by more than TOLERANCE of that entry's greatest change,
     or of SMALL. Contacts differ in some periods, because MJX finds other points; other forces do in most.
     """
-    draws, count = np.random.default_rng(seed), round(made.dt / made.model.opt.timestep)
+    draws, count = np.random.default_rng(0), round(made.dt / made.model.opt.timestep)
     data, step = mujoco.MjData(made.model), jax.jit(made.step)
-    first = made.reset(jax.random.key(seed))
+    first = made.reset(jax.random.key(0))
     data.qpos[:], data.qvel[:] = first.qpos, first.qvel
     off, change = [], []
     mujoco.set_mju_user_warning(lambda text: None)  # else it is on stderr, and in a file in the working folder
-    for period in range(periods):
+    for period in range(PERIODS):
         now = (data.qpos, data.qvel, data.act, data.qacc_warmstart, data.time)
         state = mjcf_plant.Moving(*(jnp.array(part, first.qpos.dtype) for part in now))
         before, control = np.concatenate([data.qpos, data.qvel]), draws.uniform(made.control_low, made.control_high)
@@ -51,7 +51,7 @@ def compare(made: mjcf_plant.Mechanism, periods: int = PERIODS, seed: int = 0) -
     if differs.mean() > MOST:
         worst = mjcf_plant.full_state_names(made.model)[int(np.argmax(np.median(np.array(off) / greatest, axis=0)))]
         raise ValueError(
-            f"MJX does not simulate it as MuJoCo does: {worst} differs in {differs.sum()} of {periods} control periods;"
+            f"MJX does not simulate it as MuJoCo does: {worst} differs in {differs.sum()} of {PERIODS} control periods;"
             " leave out what MJX does not know"
         )
 
