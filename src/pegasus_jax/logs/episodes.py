@@ -182,7 +182,7 @@ def with_rates(x: np.ndarray, task: Task) -> np.ndarray:
         change = np.diff(whole[:, i])
         change = np.arctan2(np.sin(change), np.cos(change)) if i in task.angles else change
         whole[1:, rate] = change / task.dt
-    whole[0] = np.where(np.isin(np.arange(len(task.state_names)), task.rates), whole[1], whole[0])
+        whole[0, rate] = whole[1, rate]
     return whole
 
 
