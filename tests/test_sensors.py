@@ -23,12 +23,13 @@ from pegasus_jax.exports import as_c, parity, write
 from pegasus_jax.imagine import matching
 from pegasus_jax.imagine.rollout import rollout
 from pegasus_jax.math.units import rate_of
+from pegasus_jax.memory import coordinates
 from pegasus_jax.policies.rate_limited import rate_limited
 from pegasus_jax.runs import check, config_io, facts, store
 from pegasus_jax.runs.controller import controller
 from pegasus_jax.start import preset
 from pegasus_jax.tasks.remembered import remembering, smoothed
-from pegasus_jax.tasks.sensed import coordinates, reduced, sensed
+from pegasus_jax.tasks.sensed import reduced, sensed
 from pegasus_jax.types import Cost, Dynamics, Prediction, Scenarios
 from probes import PLAIN, cart, linear_policy, tiny
 

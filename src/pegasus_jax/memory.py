@@ -142,6 +142,11 @@ def measured(task: Task) -> tuple[int, ...]:
     return tuple(range(len(task.state_names))) if task.memory.measured is None else task.memory.measured
 
 
+def coordinates(task: Task) -> list[int]:
+    """The entries of the state that are no rates, in the order of their rates."""
+    return [i for i in range(len(task.state_names)) if i not in task.rates]
+
+
 def units(memory: Memory) -> tuple[float, ...]:
     """The unit of each entry that the memory shows to the policy."""
     return memory.shown_units or (1.0,) * len(memory.shown)

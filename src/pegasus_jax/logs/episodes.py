@@ -10,7 +10,7 @@ from pegasus_jax.logs.columns import SETTING, Column, Layout, numbers, truths, u
 from pegasus_jax.logs.table import Table, names_of
 from pegasus_jax.logs.times import nearest
 from pegasus_jax.math.circles import to_state
-from pegasus_jax.memory import measured
+from pegasus_jax.memory import coordinates, measured
 from pegasus_jax.task import Task
 
 JITTER = 0.05  # of a period, by which rows may come early or late without being interpolated
@@ -177,8 +177,7 @@ def with_rates(x: np.ndarray, task: Task) -> np.ndarray:
         return x
     whole = np.zeros((len(x), len(task.state_names)))
     whole[:, places] = x
-    coordinates = [i for i in range(len(task.state_names)) if i not in task.rates]
-    for i, rate in zip(coordinates, task.rates, strict=True):
+    for i, rate in zip(coordinates(task), task.rates, strict=True):
         change = np.diff(whole[:, i])
         change = np.arctan2(np.sin(change), np.cos(change)) if i in task.angles else change
         whole[1:, rate] = change / task.dt

@@ -10,7 +10,7 @@ from pegasus_jax.checks import ConfigError, shown
 from pegasus_jax.config import Config
 from pegasus_jax.math.angles import difference, encode
 from pegasus_jax.math.units import rate_of
-from pegasus_jax.memory import combined, past_controls, resting
+from pegasus_jax.memory import combined, coordinates, past_controls, resting
 from pegasus_jax.task import Task
 from pegasus_jax.types import Array, Hindsight, Memory
 
@@ -102,7 +102,7 @@ def velocities(task: Task, weight: float) -> Memory:
     With weight 1 they are the differences themselves; with less, v + weight (difference - v), a low-pass of first
     order. The policy sees the coordinates and these rates, never rates that an observation has.
     """
-    measured = tuple(i for i in range(len(task.state_names)) if i not in task.rates)
+    measured = tuple(coordinates(task))
     positions, n = np.array(measured), len(measured)
     turning = tuple(place for place, i in enumerate(measured) if i in task.angles)
     names = tuple(task.state_names[i] for i in measured)
@@ -132,7 +132,7 @@ def smoothed(rows: Array, last: Array | int, controls: Array, *, task: Task) -> 
     that runs on the robot knows only the rows before. Positions are as measured. The second value [H, 1] is 1 in the
     row that begins the episode, and 0: a fit filters along the rows behind it (`models.innovations`).
     """
-    positions = np.array([i for i in range(len(task.state_names)) if i not in task.rates])
+    positions = np.array(coordinates(task))
     turning = tuple(place for place, i in enumerate(positions) if i in task.angles)
     weights = polynomials(task.dt)
     rows = jnp.asarray(rows)

@@ -13,7 +13,7 @@ from pegasus_jax.checks import ConfigError
 from pegasus_jax.config import Sensors
 from pegasus_jax.math.circles import Circles, to_observation, to_state
 from pegasus_jax.math.units import rate_of
-from pegasus_jax.memory import resting
+from pegasus_jax.memory import coordinates, resting
 from pegasus_jax.task import Task
 from pegasus_jax.tasks.terms import alone
 from pegasus_jax.types import Cost
@@ -64,11 +64,6 @@ def entries(task: Task, sensors: Sensors) -> list[int]:
             f" a rate itself; the nearest is sensors.measured=[{','.join(map(str, positions))}]"
         )
     return measured
-
-
-def coordinates(task: Task) -> list[int]:
-    """The entries that are no rates, in the order of their rates."""
-    return [i for i in range(len(task.state_names)) if i not in task.rates]
 
 
 def reduced(task: Task, kept: Sequence[int]) -> Task:
