@@ -85,11 +85,10 @@ def calibration(
 ) -> Array:
     """The model's one-step errors along an episode, in standard deviations that it predicted.
 
-    `errors` says how they are measured.
-
-    1 is calibrated; at 2 errors are twice as large as the model claims. The root of the median, over steps and
-    dimensions, of squared error / predictive variance, divided by its value for Gaussian errors of the predicted size;
-    the median, because a few steps outside the data would decide a mean.
+    `errors` is `one_step_errors`, or a function like it. 1 is calibrated; at 2 errors are twice as large as the model
+    claims. The root of the median, over steps and dimensions, of squared error / predictive variance, divided by its
+    value for Gaussian errors of the predicted size; the median, because a few steps outside the data would decide a
+    mean.
     """
     error, variance = errors(key, posterior, trajectory, dynamics=dynamics, angles=angles, draws=draws)
     took_place = ran(trajectory)[:, None]
