@@ -22,19 +22,20 @@ def one_step_errors(
     *,
     dynamics: Dynamics,
     angles: tuple[int, ...],
-    draws: int = DRAWS,
+    draws: int,
 ) -> tuple[Array, Array]:
     """Errors of the model's mean along an episode, and the variances that it predicts for them: each [H, D].
 
     The predictive variance is that of the draws' means, what the model does not know, and the mean square of their
     noise.
     """
-    functions = jax.vmap(dynamics.sample, (0, None))(jax.random.split(key, draws), posterior)
-    along = jax.vmap(dynamics.apply, (None, None, 0, 0))
-    predicted = jax.vmap(along, (None, 0, None, None))(posterior, functions, trajectory.x[:-1], trajectory.u)
-    variance = jnp.var(predicted.mean, axis=0, ddof=1) + jnp.mean(predicted.std**2, axis=0)
-    error = difference(difference(trajectory.x[1:], trajectory.x[:-1], angles), jnp.mean(predicted.mean, 0), angles)
-    return error, variance
+
+    def along(function: Params) -> tuple[Array, Array]:
+        predicted = jax.vmap(partial(dynamics.apply, posterior, function))(trajectory.x[:-1], trajectory.u)
+        return predicted.mean, predicted.std**2
+
+    mean, variance = over_draws(along, key, posterior, dynamics=dynamics, draws=draws)
+    return difference(difference(trajectory.x[1:], trajectory.x[:-1], angles), mean, angles), variance
 
 
 def filtered_errors(
@@ -46,7 +47,7 @@ def filtered_errors(
     angles: tuple[int, ...],
     rates: tuple[int, ...],
     dt: float,
-    draws: int = DRAWS,
+    draws: int,
 ) -> tuple[Array, Array]:
     """As `one_step_errors`, where only the positions [n] were measured, and `rates` computed from them: each [H, n].
 
@@ -54,7 +55,6 @@ def filtered_errors(
     which are not the model's.
     """
     x, u = trajectory.x, trajectory.u
-    functions = jax.vmap(dynamics.sample, (0, None))(jax.random.split(key, draws), posterior)
     spread = jnp.var(x[:-1, np.array(rates)], 0, where=ran(trajectory)[:, None]) + 1e-12
     rows, begins = Batch(x[:-1], u, difference(x[1:], x[:-1], angles)), jnp.zeros(len(u), bool)
 
@@ -63,8 +63,16 @@ def filtered_errors(
         found = filtered(predict, rows, begins, spread, rates=rates, angles=angles, dt=dt)
         return found.error, found.variance
 
-    error, variance = jax.vmap(along)(functions)
-    return jnp.mean(error, 0), jnp.var(error, axis=0, ddof=1) + jnp.mean(variance, axis=0)
+    return over_draws(along, key, posterior, dynamics=dynamics, draws=draws)
+
+
+def over_draws(
+    along: Callable[[Params], tuple[Array, Array]], key: Key, posterior: Params, *, dynamics: Dynamics, draws: int
+) -> tuple[Array, Array]:
+    """Mean and variance over draws of the model, of each of which `along` tells a mean and a variance."""
+    functions = jax.vmap(dynamics.sample, (0, None))(jax.random.split(key, draws), posterior)
+    mean, variance = jax.vmap(along)(functions)
+    return jnp.mean(mean, 0), jnp.var(mean, axis=0, ddof=1) + jnp.mean(variance, axis=0)
 
 
 def ran(trajectory: Trajectory) -> Array:
