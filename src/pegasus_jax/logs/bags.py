@@ -31,7 +31,7 @@ def of_bag(path: Path, names: Names, columns: Sequence[str], control: str = "sen
         raise ConfigError(f"data={path} needs rosbags: pip install 'pegasus-jax[logs]'") from error
     said = mapped(columns, names)
     for name in ("t", EPISODE):
-        if name in said and name not in names.observation:
+        if name in said and name not in (*names.observation, *names.control):
             raise ConfigError(f"{path}: {SETTING} names {name}, and a bag has the times of its messages; leave it out")
     try:
         with AnyReader([whole(path)], default_typestore=get_typestore(Stores.LATEST)) as bag:
